@@ -37,7 +37,9 @@ def dynamax_smoother(chain: Chain) -> Callable[[], float]:
     matrices = jax.numpy.asarray(transitions(chain)[:, 1:].exp().numpy())
     emission = jax.numpy.asarray(chain.emission.numpy())
 
-    def smooth(first, matrix, likelihood):  # the posteriors that our pass gives too: of choices and of transitions
+    def smooth(
+        first, matrix, likelihood
+    ):  # the posteriors that our pass gives too: of choices and of transitions
         found = hmm_smoother(first, matrix, likelihood)
         return found.marginal_loglik, found.smoothed_probs, found.trans_probs
 
@@ -56,7 +58,8 @@ def discrete_hmm(chain: Chain) -> Callable[[], float]:
     means = (2 * (offset - chain.emission.clamp(min=NEVER))).sqrt().requires_grad_()
     steps = chain.emission.shape[1]
     shift = steps * (offset + 0.5 * np.log(2 * np.pi))
-    # DiscreteHMM makes a transition before its first observation: from a state that leads everywhere as the start does.
+    # DiscreteHMM makes a transition before its first observation: from a state that leads everywhere as the
+    # start does.
     arriving = torch.cat([initial[:, None, None].expand(-1, 1, initial.shape[-1], -1), matrices[:, 1:]], 1)
 
     def value_and_gradient() -> float:
@@ -78,7 +81,9 @@ def funsor_elimination(chain: Chain) -> Tensor:
     funsor.set_backend("torch")
     funsor.util._JAX_COMPILED_FUNCTION_TYPE = ()  # funsor 0.4.8 fails where a recent jax is imported too
     factors = transitions(chain) + chain.emission.unsqueeze(2)
-    first = (chain.selection[0][:, 0] + chain.emission[:, 0].unsqueeze(1)).expand(-1, chain.emission.shape[-1], -1)
+    first = (chain.selection[0][:, 0] + chain.emission[:, 0].unsqueeze(1)).expand(
+        -1, chain.emission.shape[-1], -1
+    )
     factors = torch.cat([(first - np.log(first.shape[1])).unsqueeze(1), factors[:, 1:]], 1).clamp(min=NEVER)
     sizes = factors.shape
     inputs = {
@@ -89,7 +94,11 @@ def funsor_elimination(chain: Chain) -> Tensor:
     }
     tensor = funsor.Tensor(factors, inputs)
     whole = sequential_sum_product(
-        funsor.ops.logaddexp, funsor.ops.add, tensor, funsor.Variable("time", funsor.Bint[sizes[1]]), {"before": "now"}
+        funsor.ops.logaddexp,
+        funsor.ops.add,
+        tensor,
+        funsor.Variable("time", funsor.Bint[sizes[1]]),
+        {"before": "now"},
     )
     total = whole.reduce(funsor.ops.logaddexp, frozenset({"before", "now"})).reduce(funsor.ops.add, "n")
     return total.data
@@ -117,7 +126,8 @@ def plain_hmm(number: int, steps: int, options: int = 5, controls: int = 3) -> t
 
 
 def em_steps(hierarchy: Hierarchy, batch: Batch) -> tuple[Callable[[], object], Callable[[], object]]:
-    """An iteration of EM of linear options, and one of dynamax's for an HMM with linear regressions as emissions.
+    """An iteration of EM of linear options, and one of dynamax's for an HMM with linear regressions as
+    emissions.
 
     Ours learns terminations and a meta-policy that see the state, dynamax's a matrix of transitions.
     """

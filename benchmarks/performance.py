@@ -1,9 +1,9 @@
 """What fits, gradient steps and exact inference cost: ``python benchmarks/performance.py [PART ...]``.
 
 Each part measures pairs that run one right after the other, on one thread and one core. A part's rows go to
-``benchmarks/results/PART.json`` as soon as they are known, all tables into ``docs/performance.md``, and all ratios into
-``docs/results/performance.csv``, which pages quote. Parts that are not named are measured unless their result is what
-this very code has given: an interrupted run goes on.
+``benchmarks/results/PART.json`` as soon as they are known, all tables into ``docs/performance.md``, and all
+ratios into ``docs/results/performance.csv``, which pages quote. Parts that are not named are measured unless
+their result is what this very code has given: an interrupted run goes on.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
 
 ROOT = Path(__file__).parents[1]
-COMMAND = ROOT / ".venv/bin/ddco-pyro" if (ROOT / ".venv").exists() else Path(sys.executable).with_name("ddco-pyro")
+COMMAND = (
+    ROOT / ".venv/bin/ddco-pyro" if (ROOT / ".venv").exists() else Path(sys.executable).with_name("ddco-pyro")
+)
 RESULTS, PAGE = ROOT / "benchmarks/results", ROOT / "docs/performance.md"
 RATIOS = ROOT / "docs/results/performance.csv"
 COLUMNS = ["study", "task", "method", "demonstrations", "seed", "measure", "value"]
@@ -81,7 +83,7 @@ AIMS = {
 }
 
 
-# --- problems ---------------------------------------------------------------------------------------------------------
+# --- problems -----------------------------------------------------------------------------------------------
 
 
 def problem(
@@ -94,7 +96,9 @@ def problem(
 ) -> tuple[Hierarchy, Batch]:
     """Freshly initialised networks over random observations and controls, of which a third is on a bound if clipped."""
     torch.manual_seed(0)
-    levels = [{"name": f"level-{d}", "count": k, "policy": {"network": network}} for d, k in enumerate(counts, 1)]
+    levels = [
+        {"name": f"level-{d}", "count": k, "policy": {"network": network}} for d, k in enumerate(counts, 1)
+    ]
     std = {} if kind == "binary" else {"std": 0.5}
     spec = parse_spec(
         {
@@ -105,7 +109,9 @@ def problem(
         }
     )
     state, actions = np.random.default_rng(0).normal(size=(2, number, steps, FEATURES))
-    actions = {"gaussian": actions, "clipped": actions.clip(-1, 1), "binary": np.sign(actions)}[kind][..., :controls]
+    actions = {"gaussian": actions, "clipped": actions.clip(-1, 1), "binary": np.sign(actions)}[kind][
+        ..., :controls
+    ]
     demos = (Demonstration(f"demo_{row}", {"state": state[row]}, actions[row]) for row in range(number))
     return trained_on(spec, Demonstrations(tuple(demos)))
 
@@ -123,7 +129,7 @@ def tables_of(number: int, steps: int, counts: tuple[int, ...] = (5,)) -> tuple[
         return hierarchy.tabulate(batch), batch.lengths
 
 
-# --- gradient steps ---------------------------------------------------------------------------------------------------
+# --- gradient steps -----------------------------------------------------------------------------------------
 
 
 def step(
@@ -144,7 +150,8 @@ def step(
 def by_engine(hierarchy: Hierarchy, engine: Engine = "fused") -> Callable[[Batch], torch.Tensor]:
     """The loss of training."""
     return lambda piece: (
-        -log_likelihood(hierarchy(piece.inputs).logits(piece.actions), piece.lengths, engine).sum() / piece.steps
+        -log_likelihood(hierarchy(piece.inputs).logits(piece.actions), piece.lengths, engine).sum()
+        / piece.steps
     )
 
 
@@ -180,7 +187,7 @@ def over_other_engines() -> Iterator[Row]:
         yield side_by_side((f"funsor step {size}", "step"), step(*case, by_funsor(case[0])), ours, 3)
 
 
-# --- inference alone --------------------------------------------------------------------------------------------------
+# --- inference alone ----------------------------------------------------------------------------------------
 
 
 def kernel(tables: Tables, lengths: torch.Tensor) -> Callable[[], float]:
@@ -209,7 +216,9 @@ def inference() -> Iterator[Row]:
         tables, lengths = tables_of(number, steps)
         size, ours, chain = f"{number} × {steps}", kernel(tables, lengths), complete(tables, lengths)
         few = 1 if steps > 1000 else 5
-        yield side_by_side((f"Pyro enumeration {size}", "pass"), enumeration(tables, lengths), ours, few, warm=few > 1)
+        yield side_by_side(
+            (f"Pyro enumeration {size}", "pass"), enumeration(tables, lengths), ours, few, warm=few > 1
+        )
         same(ours(), float(peers.funsor_elimination(chain)))
         for name, peer in (
             ("dynamax smoother", peers.dynamax_smoother(chain)),
@@ -233,9 +242,14 @@ def growth() -> Iterator[Row]:
         names = f"{levels} levels of 5 options ({choices} joint choices)", "one level (6 choices)"
         yield side_by_side(names, kernel(*tables_of(50, 200, (5,) * levels)), short)
     deep = problem("linear", 50, 200, (5, 5, 5))
-    path, training = partial(most_likely_path, *tables_of(50, 200, (5, 5, 5))), step(*deep, by_engine(deep[0]))
+    path, training = (
+        partial(most_likely_path, *tables_of(50, 200, (5, 5, 5))),
+        step(*deep, by_engine(deep[0])),
+    )
     yield side_by_side(("most likely path, 3 levels", "gradient step"), path, training)
-    steps = [step(*case, by_engine(case[0])) for n in (9, 3) for case in [problem("linear", 50, 200, controls=n)]]
+    steps = [
+        step(*case, by_engine(case[0])) for n in (9, 3) for case in [problem("linear", 50, 200, controls=n)]
+    ]
     yield side_by_side(("step with 9 control dimensions", "3 dimensions"), *steps)
 
 
@@ -248,12 +262,14 @@ def threads() -> Iterator[Row]:
         torch.set_num_threads(number)
         ours()
 
-    yield side_by_side(("pass, one thread", "all threads"), partial(on, 1), partial(on, every), 15, time.perf_counter)
+    yield side_by_side(
+        ("pass, one thread", "all threads"), partial(on, 1), partial(on, every), 15, time.perf_counter
+    )
     torch.set_num_threads(1)
     os.sched_setaffinity(0, {max(CORES)})
 
 
-# --- memory -----------------------------------------------------------------------------------------------------------
+# --- memory -------------------------------------------------------------------------------------------------
 
 
 def memory() -> Iterator[Row]:
@@ -266,7 +282,9 @@ def memory() -> Iterator[Row]:
 
 
 def _in_process(*what: str) -> float:
-    ended = subprocess.run([sys.executable, __file__, "--peak", *what], capture_output=True, text=True, check=True)
+    ended = subprocess.run(
+        [sys.executable, __file__, "--peak", *what], capture_output=True, text=True, check=True
+    )
     return float(ended.stdout)
 
 
@@ -290,7 +308,7 @@ def _status(what: str) -> float:
     return next(float(line.split()[1]) for line in lines if line.startswith(f"{what}:"))
 
 
-# --- EM and whole fits ------------------------------------------------------------------------------------------------
+# --- EM and whole fits --------------------------------------------------------------------------------------
 
 
 ALONE = {"control.power": 1.0, "training.optimizer.ridge": {"policy": 0.0, "gate": 0.0}}
@@ -298,18 +316,26 @@ ALONE = {"control.power": 1.0, "training.optimizer.ridge": {"policy": 0.0, "gate
 
 
 def em() -> Iterator[Row]:
-    """EM until the training likelihood of Adam's whole training, processor time; and a step of EM beside dynamax's.
+    """EM until the training likelihood of Adam's whole training, processor time; and a step of EM beside
+    dynamax's.
 
     Both maximise the likelihood alone: ``init``'s ridges and its power are for held-out demonstrations.
     """
     with tempfile.TemporaryDirectory() as folder:
         spec = load_spec(initial_spec(Path(folder)))
-        train, tune = train_and_valid(spec, demonstrations(spec))["train"].split(spec.training.tune_fraction, spec.seed)
+        train, tune = train_and_valid(spec, demonstrations(spec))["train"].split(
+            spec.training.tune_fraction, spec.seed
+        )
         traces = {}
         for name in ("em", "adam"):
             trace: list[tuple[float, float]] = []
             traces[name] = trace
-            budget = {**ALONE, "training.optimizer.name": name, "training.layerwise": False, "training.epochs": 1000}
+            budget = {
+                **ALONE,
+                "training.optimizer.name": name,
+                "training.layerwise": False,
+                "training.epochs": 1000,
+            }
             trainer = Trainer(with_overrides(spec, budget), Dimensions.of(train), train, tune)
             trainer.on_event = partial(_traced, trace)
             start = time.process_time()
@@ -317,7 +343,9 @@ def em() -> Iterator[Row]:
             traces[name] = [(1e3 * (at - start), value) for at, value in trace]
         best = max(value for _, value in traces["adam"])
         reached = next((at for at, value in traces["em"] if value >= best), float("nan"))
-        yield of_pairs(("Adam, until it converges", "EM, until as likely"), [(traces["adam"][-1][0], reached)])
+        yield of_pairs(
+            ("Adam, until it converges", "EM, until as likely"), [(traces["adam"][-1][0], reached)]
+        )
     for number, steps in SIZES[:2]:
         ours, theirs = peers.em_steps(*problem("linear", number, steps))
         yield side_by_side((f"dynamax EM iteration {number} × {steps}", "EM iteration"), theirs, ours, 3)
@@ -343,8 +371,8 @@ def made(
     """Write made-up demonstrations of four skills of equal length, each a linear policy.
 
     :param scale: of the policies' weights.
-    :param kept: the share of a state that is left a step later; below 1, states stay near 0 in demonstrations of any
-        length.
+    :param kept: the share of a state that is left a step later; below 1, states stay near 0 in demonstrations
+        of any length.
     """
     gains = np.random.default_rng(1).normal(size=(4, 12, controls), scale=scale)
     random = np.random.default_rng(0)
@@ -367,7 +395,10 @@ def fits() -> Iterator[Row]:
         data["training"]["epochs"] = 40
         needle.write_text(yaml.safe_dump(data))
         subprocess.run([COMMAND, "collect", needle, "--out", collected], check=True, capture_output=True)
-        for what, spec in (("needle 100 × 15, 40 epochs", needle), ("init's spec 50 × 60", initial_spec(folder))):
+        for what, spec in (
+            ("needle 100 × 15, 40 epochs", needle),
+            ("init's spec 50 × 60", initial_spec(folder)),
+        ):
             runs = [_fit(spec, folder, cache) for cache in ("cache", "cache")]
             for clock, unit in enumerate(("wall", "CPU")):
                 names = f"fit {what}, nothing compiled, {unit}", "compiled before"
@@ -399,7 +430,9 @@ def large() -> Iterator[Row]:
         made(path, *LARGE, scale=0.2, kept=0.99)  # a tenth of the controls are on a bound
         cpu, peak = 0.0, 0.0
         for arguments in (["init", path, "--out", spec], ["fit", spec, "--out", Path(name) / "run"]):
-            child = subprocess.Popen([COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            child = subprocess.Popen(
+                [COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
             _, status, used = os.wait4(child.pid, 0)
             assert status == 0
             cpu, peak = cpu + used.ru_utime + used.ru_stime, max(peak, used.ru_maxrss / 1024)
@@ -408,7 +441,7 @@ def large() -> Iterator[Row]:
         yield of_pairs((f"{what}, peak memory", GIGABYTE), [(peak, 1000.0)], "MiB")
 
 
-# --- all parts --------------------------------------------------------------------------------------------------------
+# --- all parts ----------------------------------------------------------------------------------------------
 
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "fits": fits,
@@ -433,7 +466,8 @@ def measure(part: str, again: bool) -> None:
     for row in PARTS[part]():
         rows.append(row._asdict())
         print(
-            f"{part}: {row.first} {row.value:.3g} {row.unit}, {row.second} {row.other:.3g}: {row.ratio:.3g}", flush=True
+            f"{part}: {row.first} {row.value:.3g} {row.unit}, {row.second} {row.other:.3g}: {row.ratio:.3g}",
+            flush=True,
         )
     RESULTS.mkdir(exist_ok=True)
     path.write_text(text({"rows": rows}, made_by))
@@ -461,12 +495,19 @@ def ratios() -> Iterator[dict[str, Any]]:
     """All kept ratios as rows of a tidy table; the method is what was measured."""
     for part, _, rows in known():
         for row in rows:
-            yield {"study": part, "method": row.first, "measure": f"over {row.second}", "value": f"{row.ratio:.4g}"}
+            yield {
+                "study": part,
+                "method": row.first,
+                "measure": f"over {row.second}",
+                "value": f"{row.ratio:.4g}",
+            }
 
 
 def main() -> None:
     """Measure the parts that are named, or all that are not known."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
     asked = parser.parse_args()

@@ -45,7 +45,9 @@ def made(number: int, steps: int) -> Demonstrations:
     def one(index: int) -> Demonstration:
         camera = random.integers(0, 256, (steps, *SIZE), dtype=np.uint8)
         return Demonstration(
-            f"demo_{index}", {"pose": random.normal(size=(steps, 3)), "camera": camera}, random.normal(size=(steps, 3))
+            f"demo_{index}",
+            {"pose": random.normal(size=(steps, 3)), "camera": camera},
+            random.normal(size=(steps, 3)),
         )
 
     return Demonstrations(tuple(one(index) for index in range(number)))
@@ -126,17 +128,31 @@ def networks_alone(demos: Demonstrations) -> Callable[[], float]:
 
 def chunks() -> Iterator[Row]:
     """A gradient of 240 pictures of 64 × 64 in eight chunks of time, over the same in one piece."""
-    conv = {"network": "conv", "layers": [{"filters": 8, "kernel": 5, "stride": 2, "padding": 2}], "hidden": [32]}
-    ends = {"network": "conv", "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}], "hidden": []}
+    conv = {
+        "network": "conv",
+        "layers": [{"filters": 8, "kernel": 5, "stride": 2, "padding": 2}],
+        "hidden": [32],
+    }
+    ends = {
+        "network": "conv",
+        "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}],
+        "hidden": [],
+    }
     steps, random = 240, np.random.default_rng(0)
     camera = random.integers(256, size=(steps, 64, 64, 3), dtype=np.uint8)
     demos = Demonstrations((Demonstration("demo_0", {"camera": camera}, random.normal(size=(steps, 3))),))
-    for name, policy in {"conv": conv, "lstm over conv": {"network": "lstm", "over": conv, "hidden": 32}}.items():
+    for name, policy in {
+        "conv": conv,
+        "lstm over conv": {"network": "lstm", "over": conv, "hidden": 32},
+    }.items():
         spec = parse_spec(
             {
                 "demonstrations": {"path": "unused.hdf5"},
                 "observations": ["camera"],
-                "hierarchy": {"levels": [{"count": 3, "policy": policy, "termination": ends}], "meta_policy": ends},
+                "hierarchy": {
+                    "levels": [{"count": 3, "policy": policy, "termination": ends}],
+                    "meta_policy": ends,
+                },
             }
         )
         made_for = Trainer(spec, Dimensions.of(demos), demos, demos)

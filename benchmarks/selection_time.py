@@ -1,11 +1,12 @@
 """How long does a selection over k = 1 to 8 on the needle data take, and how much faster is it on two cores?
 
-    python benchmarks/selection_time.py folds        # one fold of each candidate, in seconds of CPU
-    python benchmarks/selection_time.py speed-up     # a short selection with one process and with two, in seconds
+    python benchmarks/selection_time.py folds        # one fold of each candidate, in seconds of CPU python
+    benchmarks/selection_time.py speed-up     # a short selection with one process and with two, in seconds
 
-``folds`` counts the time of the CPU, so it can be measured beside other work; ten folds on two idle cores take at least
-five times the sum. ``speed-up`` compares clocks, and says how busy the machine was: on a busy one it means little.
-Writes ``benchmarks/results/selection_time_folds.json`` and ``selection_time_speed_up.json``.
+``folds`` counts the time of the CPU, so it can be measured beside other work; ten folds on two idle cores
+take at least five times the sum. ``speed-up`` compares clocks, and says how busy the machine was: on a busy
+one it means little. Writes ``benchmarks/results/selection_time_folds.json`` and
+``selection_time_speed_up.json``.
 """
 
 from __future__ import annotations
@@ -73,7 +74,9 @@ class Clock:
 
 def main() -> None:
     """Measure."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=["folds", "speed-up"])
     what = parser.parse_args().what
     found = one_fold() if what == "folds" else speed_up()

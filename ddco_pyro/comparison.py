@@ -1,7 +1,8 @@
-"""Runs compared on the demonstrations that all of them held out, and on rollouts from the same initial states.
+"""Runs compared on the demonstrations that all of them held out, and on rollouts from the same initial
+states.
 
-The table follows arviz's ``compare``: rank, total, standard error, difference to the best, its standard error. The
-held-out log-likelihood of a trajectory takes the place of an observation's elpd.
+The table follows arviz's ``compare``: rank, total, standard error, difference to the best, its standard
+error. The held-out log-likelihood of a trajectory takes the place of an observation's elpd.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ class Row:
     for one fit of each run.
 
     :param total: Σ log p(ξ_n), and its standard error ``se``; None for a single trajectory.
-    :param difference: the best run's total minus this one's, and its standard error ``dse``. The trajectories are the
-        same, so ``dse`` is smaller than the two ``se`` suggest.
+    :param difference: the best run's total minus this one's, and its standard error ``dse``. The trajectories
+        are the same, so ``dse`` is smaller than the two ``se`` suggest.
     :param per_step: Σ log p(ξ_n) per step, and the same ``in_training``.
     :param each: log p(ξ_n) of every trajectory.
     """
@@ -94,7 +95,9 @@ class Comparison:
             }
             for place, (name, steps) in enumerate(zip(self.trajectories, self.steps, strict=True))
         ]
-        return sorted(listed, key=lambda demonstration: demonstration["log_likelihood_per_step"][self.sorted_by])
+        return sorted(
+            listed, key=lambda demonstration: demonstration["log_likelihood_per_step"][self.sorted_by]
+        )
 
     def as_data(self) -> dict[str, Any]:
         """The comparison as plain data for ``compare.json``."""
@@ -116,13 +119,16 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     (2, 0.0)
 
     :param allow_code: import the user code that the specs name.
-    :raises BadInput: there are fewer than two runs, one is named twice or unfinished, or they held out different data.
+    :raises BadInput: there are fewer than two runs, one is named twice or unfinished, or they held out
+        different data.
     """
     folders = [path_of(run, "runs") for run in runs]
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise BadInput("the same run is given twice; name each once")
     if len(folders) < 2:
-        raise BadInput("one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat")
+        raise BadInput(
+            "one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat"
+        )
     fits = [load(folder, allow_code) for folder in folders]
     demos = _shared(fits)
     values = [_log_likelihoods(fit, own) for fit, own in zip(fits, demos, strict=True)]
@@ -131,11 +137,19 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     rows = [_row(rank, fits[run], values[run], best, demos[0].lengths) for rank, run in enumerate(order)]
     ranked = [fits[run] for run in order]
     every = (row for fit in ranked for row in _agreement(fit))
-    agreement = {(row["run"], row["level"], row["labels"]): row for row in every}  # several runs have the same parts
+    agreement = {
+        (row["run"], row["level"], row["labels"]): row for row in every
+    }  # several runs have the same parts
     sorted_by = next((fit.place for fit in ranked if fit.spec.hierarchy), ranked[0].place)
     marginal = next((fit.metrics.marginal for fit in ranked if fit.metrics.marginal), None)
     return Comparison(
-        rows, demos[0].names, demos[0].lengths, [*agreement.values()], _paired_rollouts(ranked), sorted_by, marginal
+        rows,
+        demos[0].names,
+        demos[0].lengths,
+        [*agreement.values()],
+        _paired_rollouts(ranked),
+        sorted_by,
+        marginal,
     )
 
 
@@ -225,7 +239,8 @@ def _log_likelihoods(fit: Fit, demos: Demonstrations) -> np.ndarray:
 
 
 def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
-    """For each level of options: the measures that need no matching, and ``accuracy`` with options matched globally.
+    """For each level of options: the measures that need no matching, and ``accuracy`` with options matched
+    globally.
 
     The same is given for equal parts of each demonstration, as many as options.
     A measure is None where no label is known.
@@ -234,7 +249,9 @@ def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
     if not record or not record.valid or fit.spec.hierarchy is None:
         return
     equal = record.equal_valid or [None] * len(record.valid)
-    for level, labels, *each in zip(fit.spec.hierarchy.levels, record.labels, record.valid, equal, strict=True):
+    for level, labels, *each in zip(
+        fit.spec.hierarchy.levels, record.labels, record.valid, equal, strict=True
+    ):
         for run, scores in zip((fit.place, f"equal lengths, {level.count} parts"), each, strict=True):
             found = {key: scores and getattr(scores, key) for key in UNMATCHED}
             accuracy = scores and scores.matched_globally.accuracy
@@ -242,7 +259,8 @@ def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
 
 
 def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:
-    """Success of each run against the first one that was rolled out in the task, on the initial states of both.
+    """Success of each run against the first one that was rolled out in the task, on the initial states of
+    both.
 
     ``p_value`` is McNemar's exact one.
     """
@@ -255,7 +273,9 @@ def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:
             left, right = [ours[seed] for seed in seeds], [theirs[seed] for seed in seeds]
             rates = {"rate": rate(int(sum(left)), len(left)), "other_rate": rate(int(sum(right)), len(right))}
             each = {name: one.model_dump() for name, one in rates.items()}
-            pairs.append({"run": first.place, "other": fit.place, **dict(paired_difference(left, right)), **each})
+            pairs.append(
+                {"run": first.place, "other": fit.place, **dict(paired_difference(left, right)), **each}
+            )
     return pairs
 
 
@@ -271,7 +291,7 @@ def _outcomes(fit: Fit) -> dict[int, float]:
     return {}
 
 
-# --- the page ---------------------------------------------------------------------------------------------------------
+# --- the page -----------------------------------------------------------------------------------------------
 
 
 def write(compared: Comparison, folder: Path) -> Path:
@@ -301,7 +321,9 @@ def page(compared: Comparison, picture: Drawing, folder: Path) -> Page:
     sections = [Section("likelihood", "Held-out log-likelihood", likelihood)]
     if agreement := agreement_table(compared):
         sections.append(
-            Section("agreement", "Agreement with labels", [agreement, note(f"Held-out trajectories. {EXPLAINED}")])
+            Section(
+                "agreement", "Agreement with labels", [agreement, note(f"Held-out trajectories. {EXPLAINED}")]
+            )
         )
     links = _links(compared, folder)
     listed = (
@@ -312,7 +334,9 @@ def page(compared: Comparison, picture: Drawing, folder: Path) -> Page:
     sections.append(Section("demonstrations", "Every held-out demonstration", blocks))
     if rollouts := rollout_table(compared):
         title = "Success in rollouts from the same initial states"
-        sections.append(Section("rollouts", title, [rollouts, note(f"Rates: Wilson 95 % intervals. {words.P_VALUE}")]))
+        sections.append(
+            Section("rollouts", title, [rollouts, note(f"Rates: Wilson 95 % intervals. {words.P_VALUE}")])
+        )
     return Page(f"Comparison of {len(compared.rows)} runs", [Text(verdict(compared), "verdict")], sections)
 
 
@@ -356,7 +380,12 @@ def rollout_table(compared: Comparison) -> Table | None:
     """A row for each pair of runs that were rolled out; None where there is none."""
     rows = []
     for pair in compared.rollouts:
-        runs = [pair["run"], words.rate(Rate(**pair["rate"])), pair["other"], words.rate(Rate(**pair["other_rate"]))]
+        runs = [
+            pair["run"],
+            words.rate(Rate(**pair["rate"])),
+            pair["other"],
+            words.rate(Rate(**pair["other_rate"])),
+        ]
         counts = [str(pair["only_ours"]), str(pair["only_theirs"]), str(pair["trials"])]
         rows.append([*runs, *counts, words.p_value(pair["p_value"])])
     head = ["run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p"]
@@ -368,7 +397,9 @@ def verdict(compared: Comparison) -> str:
     best, *others = compared.rows
     steps = np.array(compared.steps, dtype=float)
     each = {row.name: np.array(row.each) for row in compared.rows}
-    train, kinds = ({row.name: getattr(row, key) for row in compared.rows} for key in ("in_training", "model"))
+    train, kinds = (
+        {row.name: getattr(row, key) for row in compared.rows} for key in ("in_training", "model")
+    )
     models = verdicts.Models(each, train, steps, kinds, compared.marginal)
     told = [" ".join(doubt) for name in each for doubt in models.doubts(name)]
     leads = {row.name: models.lead(best.name, row.name) for row in others}

@@ -41,8 +41,8 @@ SIZE = 64
 """Most principal components unless their number is given."""
 
 NOISE = 1e-4
-"""Share of the first component's variance below which a component is noise: a hundredth of its spread. All components
-have the unit of the features; standardised one by one, noise would count as much as what moves."""
+"""Share of the first component's variance below which a component is noise: a hundredth of its spread. All
+components have the unit of the features; standardised one by one, noise would count as much as what moves."""
 
 TOLERANCE = 1e-3
 """Largest difference between two calls on the same picture, as a part of the largest feature."""
@@ -51,15 +51,15 @@ ENCODERS = "encoders"
 """Group of a file: the encoder of each observation that was encoded."""
 
 
-# --- backbones --------------------------------------------------------------------------------------------------------
+# --- backbones ----------------------------------------------------------------------------------------------
 
 
 class Backbone:
     """A frozen network: uint8 pictures [N, H, W, C] to features [N, F].
 
     :param name: ``timm:NAME`` for a pretrained model of timm, or a user's ``module:function``.
-    :raises BadInput: it cannot be had, or is user code and that is not allowed; at a call, it fails or gives no
-        features.
+    :raises BadInput: it cannot be had, or is user code and that is not allowed; at a call, it fails or gives
+        no features.
     """
 
     def __init__(self, name: str, allow_code: bool = False) -> None:
@@ -93,7 +93,9 @@ class Backbone:
         try:
             values = np.asarray(self._call(pictures))
         except Exception as error:
-            raise BadInput(f"encoder {self.name!r} fails on pictures {[*pictures.shape]}: {_message(error)}") from error
+            raise BadInput(
+                f"encoder {self.name!r} fails on pictures {[*pictures.shape]}: {_message(error)}"
+            ) from error
         count = len(pictures)
         if values.dtype.kind != "f" or values.ndim != 2 or len(values) != count or not values.shape[1]:
             had = f"{values.dtype} {[*values.shape]} for {count} pictures; it has to be floats [{count}, features]"
@@ -145,7 +147,7 @@ def _message(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-# --- principal components ---------------------------------------------------------------------------------------------
+# --- principal components -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ def principal_components(blocks: Sequence[np.ndarray], size: int, least: float =
     return Projection(fitted.mean_, fitted.components_[:size], explained)
 
 
-# --- encoders ---------------------------------------------------------------------------------------------------------
+# --- encoders -----------------------------------------------------------------------------------------------
 
 
 class About(Model):
@@ -242,19 +244,23 @@ def load(path: str | Path, key: str | None = None, allow_code: bool = False) -> 
         known = list(file.get(ENCODERS, ()))
         if key not in known and (key is not None or len(known) != 1):
             there = ", ".join(known) or "none"
-            raise DemonstrationsError(f"there is no encoder of {key or 'one observation alone'}; there is: {there}")
+            raise DemonstrationsError(
+                f"there is no encoder of {key or 'one observation alone'}; there is: {there}"
+            )
         group = file[ENCODERS][key or known[0]]
         try:
             about = About.model_validate_json(group.attrs["about"])
         except ValidationError as error:
-            raise DemonstrationsError(f"{group.name} is damaged ({_message(error)}); encode the file again") from error
+            raise DemonstrationsError(
+                f"{group.name} is damaged ({_message(error)}); encode the file again"
+            ) from error
         projection = None
         if "components" in group:
             projection = Projection(group["mean"][()], group["components"][()], about.explained)
     return Encoder(about, Backbone(about.encoder, allow_code), projection)
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files --------------------------------------------------------------------------------------------------
 
 
 def encode(
@@ -267,18 +273,21 @@ def encode(
     on_event: OnEvent = ignore,
     allow_code: bool = False,
 ) -> Encoder:
-    """Write the demonstrations of ``path`` to ``out``, with features in place of pictures, and return the encoder.
+    """Write the demonstrations of ``path`` to ``out``, with features in place of pictures, and return the
+    encoder.
 
-    ``out`` holds the encoder, too. Principal components are those of the training demonstrations: ``mask/train``, else
-    all that are not in ``mask/valid``.
+    ``out`` holds the encoder, too. Principal components are those of the training demonstrations:
+    ``mask/train``, else all that are not in ``mask/valid``.
 
     :param observation: the key of the pictures, uint8 [T, H, W, C].
     :param encoder: ``timm:NAME`` or ``module:function``.
     :param size: number of principal components. By default at most :data:`SIZE`, without those that are noise
         (:data:`NOISE`); fewer features are not projected.
     :param name: the new observation's key; ``<observation>_features`` by default.
-    :raises DemonstrationsError: the demonstrations cannot be used, or the observation is missing or no picture.
-    :raises BadInput: ``out`` is there already; the encoder cannot be used, or gives fewer features than ``size``.
+    :raises DemonstrationsError: the demonstrations cannot be used, or the observation is missing or no
+        picture.
+    :raises BadInput: ``out`` is there already; the encoder cannot be used, or gives fewer features than
+        ``size``.
     """
     path, out, key = Path(path), Path(out), name or f"{observation}_features"
     if out.exists():
@@ -333,7 +342,9 @@ def _checked(source: Source, demos: Mapping[str, Demonstration], key: str) -> tu
     if key not in first.observations:
         known = [name for name, array in first.observations.items() if is_picture(array)]
         there = ", ".join(known) or "none"
-        raise DemonstrationsError(f"there is no observation {key!r}{nearest(key, known)}; pictures are: {there}")
+        raise DemonstrationsError(
+            f"there is no observation {key!r}{nearest(key, known)}; pictures are: {there}"
+        )
     for name, demo in demos.items():
         check(demo, first)
         array = demo.observations[key]

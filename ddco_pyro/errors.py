@@ -56,7 +56,9 @@ def needing(extra: str, what: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise BadInput(f"{what} needs {error.name}; install it with: pip install 'ddco-pyro[{extra}]'") from None
+        raise BadInput(
+            f"{what} needs {error.name}; install it with: pip install 'ddco-pyro[{extra}]'"
+        ) from None
 
 
 def refuse_unknown(

@@ -98,7 +98,7 @@ def ignore(event: Event) -> None:
     """Discard an event."""
 
 
-# --- logs -------------------------------------------------------------------------------------------------------------
+# --- logs ---------------------------------------------------------------------------------------------------
 
 
 Add = Callable[[Mapping[str, float], int], None]
@@ -123,7 +123,9 @@ def wandb_offline(folder: Path, spec: Mapping[str, Any]) -> tuple[Add, Callable[
     """A run in ``wandb`` of the run folder, which ``wandb sync`` uploads; nothing is sent before."""
     import wandb
 
-    run: Any = wandb.init(project="ddco-pyro", name=folder.name, dir=str(folder), mode="offline", config=dict(spec))
+    run: Any = wandb.init(
+        project="ddco-pyro", name=folder.name, dir=str(folder), mode="offline", config=dict(spec)
+    )
     return lambda values, step: run.log({**values, "epoch": step}), run.finish
 
 
@@ -134,8 +136,8 @@ LOGS = {"tensorboard": (tensorboard, "tensorboard"), "wandb-offline": (wandb_off
 class Log:
     """The log-likelihoods of each epoch in another program, in nats per step.
 
-    ``<model>/<stage>/train`` and ``tune`` have a value for each epoch of a stage; restarts after the first are
-    ``<model>/<stage>/restart <n>/train``. Where the program fails, the fit goes on without the log.
+    ``<model>/<stage>/train`` and ``tune`` have a value for each epoch of a stage; restarts after the first
+    are ``<model>/<stage>/restart <n>/train``. Where the program fails, the fit goes on without the log.
 
     :param name: one of :data:`LOGS`.
     :param folder: the run folder; nothing is written there before training begins.
@@ -148,10 +150,14 @@ class Log:
         self, name: str, folder: str | Path, spec: Mapping[str, Any], say: Callable[[str], None] = print
     ) -> None:
         if name not in LOGS:
-            raise BadInput(f"--log: there is no log {name!r}{nearest(name, LOGS)}; there is: {', '.join(LOGS)}")
+            raise BadInput(
+                f"--log: there is no log {name!r}{nearest(name, LOGS)}; there is: {', '.join(LOGS)}"
+            )
         self._make, package = LOGS[name]
         if find_spec(package) is None:
-            raise BadInput(f"--log {name}: needs {package}; install it with: pip install 'ddco-pyro[{package}]'")
+            raise BadInput(
+                f"--log {name}: needs {package}; install it with: pip install 'ddco-pyro[{package}]'"
+            )
         self._name, self._of, self._say = name, (Path(folder), spec), say
         self._program: tuple[Add, Callable[[], None]] | None = None
         self._model, self._failed = "", False

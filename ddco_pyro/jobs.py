@@ -23,8 +23,14 @@ Result = TypeVar("Result")
 ALL_CORES = -1
 """The number of ``jobs`` that stands for one for each core."""
 
-for said in ("A worker stopped", r"\d+ tasks which were still being processed", r"\d+ tasks have been successfully"):
-    warnings.filterwarnings("ignore", said, UserWarning)  # of processes that are replaced, and calls that are given up
+for said in (
+    "A worker stopped",
+    r"\d+ tasks which were still being processed",
+    r"\d+ tasks have been successfully",
+):
+    warnings.filterwarnings(
+        "ignore", said, UserWarning
+    )  # of processes that are replaced, and calls that are given up
 
 
 def from_outside(doing: str, fewer: str = "--jobs") -> str:
@@ -37,7 +43,8 @@ def from_outside(doing: str, fewer: str = "--jobs") -> str:
 
 @dataclass(frozen=True)
 class Workers:
-    """Processes that do calls: ``jobs`` of them, -1: one for each core of this machine or of joblib's backend.
+    """Processes that do calls: ``jobs`` of them, -1: one for each core of this machine or of joblib's
+    backend.
 
     :raises BadInput: ``jobs`` is not a number of processes.
     """
@@ -67,14 +74,17 @@ def run_all(
 ) -> Iterator[Iterator[tuple[Key, Result]]]:
     """Inside, the key and the result of each call, as calls are completed.
 
-    Other processes begin at once. Calls that have not ended with the block are given up, and their processes end. Where
-    this process is the only one, a call is made when its result is asked for. A call makes its own calls alone.
+    Other processes begin at once. Calls that have not ended with the block are given up, and their processes
+    end. Where this process is the only one, a call is made when its result is asked for. A call makes its own
+    calls alone.
 
     :param doing: what a call does, for the error.
-    :param on_event: given to each call. Events of a call in another process are passed on once the call is completed.
+    :param on_event: given to each call. Events of a call in another process are passed on once the call is
+        completed.
     :param ordered: whether results come in the order of the calls.
     :param beside: whether this process works on something else inside the block.
-    :param waiting: for ordered calls the event with which the wait for a call begins; the event is passed on once.
+    :param waiting: for ordered calls the event with which the wait for a call begins; the event is passed on
+        once.
     :raises Failed: a process died.
     """
     number, announced = workers.number(len(calls) + beside), waiting or {}

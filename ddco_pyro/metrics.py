@@ -1,4 +1,5 @@
-"""The contents of ``metrics.json`` (:class:`Metrics`), how its numbers are shown (:data:`METRICS`), and reading files.
+"""The contents of ``metrics.json`` (:class:`Metrics`), how its numbers are shown (:data:`METRICS`), and
+reading files.
 
 Log-likelihoods are in nats.
 """
@@ -114,7 +115,8 @@ def write_table(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, 
 
 
 def read_successes(folder: Path) -> dict[tuple[str, int], float]:
-    """Success (1) or failure (0) of a run's rollouts by method and seed; empty without rollouts or without success.
+    """Success (1) or failure (0) of a run's rollouts by method and seed; empty without rollouts or without
+    success.
 
     :raises Damaged: ``rollouts.csv`` is damaged.
     """
@@ -131,7 +133,9 @@ def read_successes(folder: Path) -> dict[tuple[str, int], float]:
 
 def refit(folder: Path, remove: str = "it") -> str:
     """The remedy for a damaged file of a run; what the checkpoints hold is not trained again."""
-    return f"remove {remove} and fit again: {command('fit', folder / 'spec.yaml', '--out', folder, '--resume')}"
+    return (
+        f"remove {remove} and fit again: {command('fit', folder / 'spec.yaml', '--out', folder, '--resume')}"
+    )
 
 
 class Parts(Record, Generic[T]):
@@ -144,8 +148,8 @@ class Parts(Record, Generic[T]):
 class Marginal(Parts[Finite]):
     """The log-likelihood per step of a density of the control that reads no observation.
 
-    It has the kinds of the model, and is fitted to the training demonstrations. ``controls`` is the number of control
-    dimensions that vary.
+    It has the kinds of the model, and is fitted to the training demonstrations. ``controls`` is the number of
+    control dimensions that vary.
     """
 
     controls: AtLeastOne
@@ -240,8 +244,8 @@ class Training(Record):
     converged: bool
     restarts: Restarts
     objective: Finite
-    """What the best restart has: the log-likelihood of the training demonstrations (``control.power``) with the
-    log-prior of EM's ridges, nats per step."""
+    """What the best restart has: the log-likelihood of the training demonstrations (``control.power``) with
+    the log-prior of EM's ridges, nats per step."""
     device: str
     by_em: bool
     """Whether the gradient steps are EM steps over all training demonstrations."""
@@ -262,9 +266,11 @@ class Compared(Record):
 
 
 class Below(Record):
-    """By how much training demonstrations are less likely under a hierarchy than under a mixture that it contains.
+    """By how much training demonstrations are less likely under a hierarchy than under a mixture that it
+    contains.
 
-    Nats per step: of the ``objective`` of training, and of the log-likelihood. Negative where they are likelier.
+    Nats per step: of the ``objective`` of training, and of the log-likelihood. Negative where they are
+    likelier.
     """
 
     objective: Finite
@@ -306,9 +312,9 @@ SuccessWorth = Worth[Against]
 class Seeds(Record):
     """Results of a fit and its repetitions, in the order of their training seeds.
 
-    ``worth`` has the parts of :class:`Worth`. After fits it is in nats per step, with ``standard_error`` over held-out
-    demonstrations and log-likelihoods per step by model (``held_out``). After rollouts it has differences of success
-    rates, with the rates by method (``success``).
+    ``worth`` has the parts of :class:`Worth`. After fits it is in nats per step, with ``standard_error`` over
+    held-out demonstrations and log-likelihoods per step by model (``held_out``). After rollouts it has
+    differences of success rates, with the rates by method (``success``).
     """
 
     training_seeds: Annotated[list[int], Field(min_length=2)]
@@ -354,10 +360,10 @@ class Use(Record):
     - ``selected``: Σ v_t, the expected number of selections;
     - ``demonstrations``: the expected number of demonstrations with a selection, Σ_n min(1, Σ_t v_t);
     - ``duration``: expected steps from a selection to the next, Σ u_t / Σ v_t; None without a selection;
-    - ``segments``: how often the most likely paths go over to the choice; ``steps`` with it; ``length``: the median
-      steps of a segment, None without one;
-    - ``having``: the number of demonstrations with a segment; ``within``: the share of their steps with the choice,
-      None where all demonstrations have it, or none.
+    - ``segments``: how often the most likely paths go over to the choice; ``steps`` with it; ``length``: the
+      median steps of a segment, None without one;
+    - ``having``: the number of demonstrations with a segment; ``within``: the share of their steps with the
+      choice, None where all demonstrations have it, or none.
     """
 
     choice: int
@@ -373,7 +379,8 @@ class Use(Record):
 
 
 class Segments(Record):
-    """Segments of a level on the most likely paths: the ``median`` of their steps, and their ``number`` in all.
+    """Segments of a level on the most likely paths: the ``median`` of their steps, and their ``number`` in
+    all.
 
     ``twitches`` of them are too short for a skill (:func:`ddco_pyro.evaluation.options.segments_of`).
     """
@@ -476,7 +483,8 @@ class TrainedLabels(Record):
 class NamedByLabel(Record):
     """An option and the label that it stands for.
 
-    ``agreement`` is the intersection of their steps over the union, in training demonstrations with these labels.
+    ``agreement`` is the intersection of their steps over the union, in training demonstrations with these
+    labels.
     """
 
     level: str
@@ -529,8 +537,9 @@ class Confusion(Record):
 class Agreement(Record):
     """Agreement of each level's segments with the labels so named; None where no label is known.
 
-    ``equal_train`` and ``equal_valid`` are of demonstrations that are cut into equal parts, as many as there are
-    options. ``recogniser`` has, by part, the options that a recogniser alone finds at each step of its level.
+    ``equal_train`` and ``equal_valid`` are of demonstrations that are cut into equal parts, as many as there
+    are options. ``recogniser`` has, by part, the options that a recogniser alone finds at each step of its
+    level.
     """
 
     labels: list[str]
@@ -596,7 +605,9 @@ class Metrics(Record, frozen=False):
             lists += [agreement.labels, agreement.train, agreement.valid, agreement.confusion]
         wrong = {len(values) for values in lists if values is not None} - {len(counts)}
         if levels != [list(range(1 + count)) for count in counts] or wrong:
-            raise Damaged(path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy)
+            raise Damaged(
+                path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy
+            )
         return metrics
 
     def write(self, folder: Path) -> None:

@@ -70,15 +70,15 @@ def choice_names(count: int, named: Sequence[str] = ()) -> tuple[str, ...]:
     return option_name(0), *(named or map(option_name, range(1, 1 + count)))
 
 
-# --- colours ---------------------------------------------------------------------------------------------------------
+# --- colours ------------------------------------------------------------------------------------------------
 
 CONTROL = "#9a9a9a"
 
 OPTIONS = (
     "#3f90da", "#e76300", "#332288", "#ecd83c", "#882255", "#7fd8f0", "#5c3317", "#bd1f01", "#a96b59", "#000000",
 )  # fmt: skip
-"""Any two of the first five and the grey of control are more than 23 apart in CIELAB, for normal sight and for readers
-without red, green or blue cones. All ten are more than 18 apart."""
+"""Any two of the first five and the grey of control are more than 23 apart in CIELAB, for normal sight and
+for readers without red, green or blue cones. All ten are more than 18 apart."""
 
 
 def option_colour(choice: int) -> str:

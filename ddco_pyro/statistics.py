@@ -61,7 +61,9 @@ def rate(successes: int, trials: int) -> Rate:
     from scipy.stats import binomtest
 
     low, high = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return Rate(successes=successes, trials=trials, rate=successes / trials, interval=(float(low), float(high)))
+    return Rate(
+        successes=successes, trials=trials, rate=successes / trials, interval=(float(low), float(high))
+    )
 
 
 def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> Against:
@@ -94,7 +96,8 @@ def matching(counts: np.ndarray) -> np.ndarray:
 
 
 def edit_score(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """1 − Levenshtein distance of two sequences of segments / the longer one's length, of options [T] at each step.
+    """1 − Levenshtein distance of two sequences of segments / the longer one's length, of options [T] at each
+    step.
 
     >>> edit_score(np.array([1, 1, 2, 1]), np.array([1, 2, 2, 2]))
     0.6666666666666667
@@ -109,7 +112,7 @@ def edit_score(ours: np.ndarray, theirs: np.ndarray) -> float:
     return 1 - float(distances[-1]) / max(len(first), len(second))
 
 
-# --- worth: several policies, and options that last -------------------------------------------------------------------
+# --- worth: several policies, and options that last ---------------------------------------------------------
 
 
 def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Difference:
@@ -123,10 +126,12 @@ def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Differe
 
 
 def worth(ours: str, values: Mapping[str, V], difference: Callable[[V, V], T]) -> Worth[T] | None:
-    """The parts of a hierarchy's advantage, as paired differences (:func:`paired`, :func:`paired_difference`).
+    """The parts of a hierarchy's advantage, as paired differences (:func:`paired`,
+    :func:`paired_difference`).
 
-    ``memory`` is hierarchy − mixture: both have the same policies and gate, and in the hierarchy alone options last.
-    ``experts`` is mixture − flat and ``total`` is hierarchy − flat, where there is a flat baseline, named in ``flat``.
+    ``memory`` is hierarchy − mixture: both have the same policies and gate, and in the hierarchy alone
+    options last. ``experts`` is mixture − flat and ``total`` is hierarchy − flat, where there is a flat
+    baseline, named in ``flat``.
 
     :param ours: the hierarchy's name.
     :param values: by name of a model: log p(ξ) of each demonstration, or success of each episode.

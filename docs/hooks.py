@@ -1,9 +1,10 @@
-"""What the site is made of beside the pages: references generated from the code, equations, and commands that were run.
+"""What the site is made of beside the pages: references generated from the code, equations, and commands that
+were run.
 
 - ``spec.md`` comes from the spec's schema, ``cli.md`` from the command line itself.
 - ``$...$`` and ``$$...$$`` become MathML, which browsers show without a script.
-- A fence ``run`` is run while the site is built, in one folder for each page, and its output stands below it; one that
-  fails fails the build. A fence ``file NAME`` writes a file there.
+- A fence ``run`` is run while the site is built, in one folder for each page, and its output stands below it;
+  one that fails fails the build. A fence ``file NAME`` writes a file there.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def on_page_markdown(markdown: str, page: Any, **more: Any) -> str:
         )
 
 
-# --- equations --------------------------------------------------------------------------------------------------------
+# --- equations ----------------------------------------------------------------------------------------------
 
 
 def equations(text: str) -> str:
@@ -65,7 +66,7 @@ def _mathml(tex: str, display: str) -> str:
     return f'<div style="margin: 1.2em 0; overflow-x: auto">{found}</div>'
 
 
-# --- commands that are run --------------------------------------------------------------------------------------------
+# --- commands that are run ----------------------------------------------------------------------------------
 
 
 def fence(block: str, folder: Path, page: str) -> str:
@@ -104,7 +105,7 @@ def run(line: str, folder: Path, page: str) -> str:
     return "\n".join([*lines, ""])
 
 
-# --- the spec ---------------------------------------------------------------------------------------------------------
+# --- the spec -----------------------------------------------------------------------------------------------
 
 
 def spec_page() -> str:
@@ -172,7 +173,7 @@ def _cell(text: str) -> str:
     return " ".join(text.replace("``", "`").split()).replace("|", "\\|")
 
 
-# --- the commands -----------------------------------------------------------------------------------------------------
+# --- the commands -------------------------------------------------------------------------------------------
 
 
 def command_page() -> str:

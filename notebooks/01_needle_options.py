@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Which options are in the needle demonstrations?
 #
-# A simulated surgical arm picks up a needle and pushes it into a phantom, 15 steps each time. Five options under a
-# meta-policy are fitted to 100 demonstrations; nobody says where one skill ends and the next begins.
+# A simulated surgical arm picks up a needle and pushes it into a phantom, 15 steps each time. Five options
+# under a meta-policy are fitted to 100 demonstrations; nobody says where one skill ends and the next begins.
 
 # %%
 import os

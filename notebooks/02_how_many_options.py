@@ -13,9 +13,9 @@
 # %% [markdown]
 # # How many options?
 #
-# Cross-validation answers it without a robot. Ten folds and the paper's perceptrons are the default; five folds and
-# linear networks keep this page quick. Every number of options sees the same folds, so candidates are compared by their
-# *paired* differences.
+# Cross-validation answers it without a robot. Ten folds and the paper's perceptrons are the default; five
+# folds and linear networks keep this page quick. Every number of options sees the same folds, so candidates
+# are compared by their *paired* differences.
 
 # %%
 import os
@@ -38,7 +38,10 @@ SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fit
 # `ddco-pyro select specs/needle.yaml --set selection.grid.hierarchy.levels.0.count=[1,2,3,5,8] --folds 5`.
 
 # %%
-LINEAR = [f"hierarchy.{place}.network=linear" for place in ("levels.0.policy", "levels.0.termination", "meta_policy")]
+LINEAR = [
+    f"hierarchy.{place}.network=linear"
+    for place in ("levels.0.policy", "levels.0.termination", "meta_policy")
+]
 GRID = ["selection.folds=5", "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 5, 8]", "training.epochs=600"]
 spec = load_spec("../specs/needle.yaml", [*LINEAR, *GRID, "compare_with=[]", *SMALLER])
 
@@ -49,9 +52,9 @@ with Progress() as progress:
 # %%
 SVG(found.folder / "figures" / "selection.svg")
 
-# %% [markdown]
-# Where the best is the largest that was tried, the grid is too small to say how many are enough: try more. On the
-# needle task every step has its own way point, so with linear options more of them keep helping.
+# %% [markdown] Where the best is the largest that was tried, the grid is too small to say how many are
+# enough: try more. On the needle task every step has its own way point, so with linear options more of them
+# keep helping.
 
 # %%
 Markdown((found.folder / "selection.md").read_text())

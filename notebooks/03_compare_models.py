@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Which model?
 #
-# One policy, one policy for each time step, two or five options, a meta-policy that may act itself, and options of
-# options: fitted to the same demonstrations, compared on those that none of them has seen.
+# One policy, one policy for each time step, two or five options, a meta-policy that may act itself, and
+# options of options: fitted to the same demonstrations, compared on those that none of them has seen.
 
 # %%
 import os
@@ -38,12 +38,19 @@ with Progress() as watch:
     five = fit(load_spec("../specs/needle.yaml", SMALLER), None, RUNS / "needle", watch)
     two = fit(load_spec("../specs/needle.yaml", ["hierarchy.levels.0.count=2", "compare_with=[]", *SMALLER]),
               None, RUNS / "two-options", watch)  # fmt: skip
-    hybrid = fit(load_spec("../specs/needle_hybrid.yaml", ["compare_with=[]", *SMALLER]), None, RUNS / "hybrid", watch)
-    deep = fit(load_spec("../specs/needle_3level.yaml", ["compare_with=[]", *SMALLER]), None, RUNS / "3-levels", watch)
+    hybrid = fit(
+        load_spec("../specs/needle_hybrid.yaml", ["compare_with=[]", *SMALLER]), None, RUNS / "hybrid", watch
+    )
+    deep = fit(
+        load_spec("../specs/needle_3level.yaml", ["compare_with=[]", *SMALLER]),
+        None,
+        RUNS / "3-levels",
+        watch,
+    )
 
-# %% [markdown]
-# At the command line: `ddco-pyro compare runs/needle runs/needle/baselines/flat ...`. The columns are those of arviz's
-# `compare`, with trajectories for observations; `dse` is the error of a *paired* difference.
+# %% [markdown] At the command line: `ddco-pyro compare runs/needle runs/needle/baselines/flat ...`. The
+# columns are those of arviz's `compare`, with trajectories for observations; `dse` is the error of a *paired*
+# difference.
 
 # %%
 runs = [five, *five.baselines.values(), two, hybrid, deep]

@@ -13,10 +13,11 @@
 # %% [markdown]
 # # Your own demonstrations
 #
-# Anything in robomimic's HDF5 layout can be fitted. Here: 50 demonstrations of Meta-World's scripted expert, which were
-# recorded by somebody else. Their file is not part of this repository; `specs/metaworld_pick_place.yaml` says what it
-# holds and how to record one, and `NOTEBOOK_METAWORLD=FILE` in the environment says where it is. Without it
-# generated demonstrations of picking and placing take their place.
+# Anything in robomimic's HDF5 layout can be fitted. Here: 50 demonstrations of Meta-World's scripted expert,
+# which were recorded by somebody else. Their file is not part of this repository;
+# `specs/metaworld_pick_place.yaml` says what it holds and how to record one, and `NOTEBOOK_METAWORLD=FILE` in
+# the environment says where it is. Without it generated demonstrations of picking and placing take their
+# place.
 
 # %%
 import os

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Planar pushing
 #
-# A 3-link arm pushes a box to goals on its left and right (§5.1). How many demonstrations of one goal each does a
-# policy need, with and without options, and how many options? Every method has the same observations, gradient steps
-# and sweep. This page shows what `studies/pushing.py` of commit a6c01719 measured.
+# A 3-link arm pushes a box to goals on its left and right (§5.1). How many demonstrations of one goal each
+# does a policy need, with and without options, and how many options? Every method has the same observations,
+# gradient steps and sweep. This page shows what `studies/pushing.py` of commit a6c01719 measured.
 
 # %%
 import csv

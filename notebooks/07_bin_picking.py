@@ -13,9 +13,10 @@
 # %% [markdown]
 # # Surgical bin picking
 #
-# A da Vinci-like arm with inexact encoders takes pins, needles and wires out of a foam bin and sorts them into two cups
-# (Physical Experiment 2, SM 1.4). It sees masks of the objects, the shape of what it holds in them, a grasp candidate
-# and what its encoders read. Do options learned from 60 demonstrations clear the bin, and what are they?
+# A da Vinci-like arm with inexact encoders takes pins, needles and wires out of a foam bin and sorts them
+# into two cups (Physical Experiment 2, SM 1.4). It sees masks of the objects, the shape of what it holds in
+# them, a grasp candidate and what its encoders read. Do options learned from 60 demonstrations clear the bin,
+# and what are they?
 #
 # This page draws one demonstration; all else is what `studies/bin_picking.py` of commit a6c01719 measured.
 
@@ -33,8 +34,8 @@ RESULTS = Path("../docs/results")
 # %% [markdown]
 # ## A demonstration
 #
-# The first trial of a bin: approach, grasp, show what is held over the far end of the bin, carry it to its cup. Above,
-# the scene; below, what the left eye's mask shows.
+# The first trial of a bin: approach, grasp, show what is held over the far end of the bin, carry it to its
+# cup. Above, the scene; below, what the left eye's mask shows.
 
 # %%
 PHASES = ("approach", "grasp", "show", "recover", "carry", "release")
@@ -52,7 +53,8 @@ plt.show()
 # %% [markdown]
 # ## Policies
 #
-# The paper's four criteria beside flat policies with the same branches and gradient steps, and what else was measured.
+# The paper's four criteria beside flat policies with the same branches and gradient steps, and what else was
+# measured.
 
 # %%
 Markdown((RESULTS / "bin_picking.md").read_text().replace("](", "](../docs/results/"))

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Pushing from pictures
 #
-# An arm of three joints pushes a box to one goal after another, and sees nothing but the pictures of a camera (§5.1,
-# SM 1.2). Can policies be learned that read box, arm and goal from them, and do options help?
+# An arm of three joints pushes a box to one goal after another, and sees nothing but the pictures of a camera
+# (§5.1, SM 1.2). Can policies be learned that read box, arm and goal from them, and do options help?
 #
 # This page draws a demonstration; all else is what `studies/pushing_pictures.py` of commit a6c01719 measured.
 
@@ -33,8 +33,9 @@ RESULTS = Path("../docs/results")
 # %% [markdown]
 # ## What is seen
 #
-# Above, the camera's picture of 640 × 480; below, what the networks see of it, 64 × 48. The goal is the pale outline;
-# when the box has reached it a demonstration ends. The demonstrator sees the state, and its hand trembles.
+# Above, the camera's picture of 640 × 480; below, what the networks see of it, 64 × 48. The goal is the pale
+# outline; when the box has reached it a demonstration ends. The demonstrator sees the state, and its hand
+# trembles.
 
 # %%
 demonstration = run_episode(find_task("pushing_goal"), "scripted_noisy_0.3", seed=0, observed=["camera"])

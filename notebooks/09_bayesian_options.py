@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Bayesian options
 #
-# The model of this project, an abstract hidden Markov model (AHMM), is a Pyro program. This notebook uses the program
-# as a Pyro user would. It compares the compiled inference with Pyro's, puts priors on the weights of linear options,
-# samples their posterior, and checks the result.
+# The model of this project, an abstract hidden Markov model (AHMM), is a Pyro program. This notebook uses the
+# program as a Pyro user would. It compares the compiled inference with Pyro's, puts priors on the weights of
+# linear options, samples their posterior, and checks the result.
 
 # %%
 import os
@@ -62,8 +62,9 @@ RUNS = Path(os.environ.get("NOTEBOOK_RUNS", "../runs/notebooks"))
 # %% [markdown]
 # ## Demonstrations
 #
-# A point on a line has two skills: move towards +1, and move towards −1. A skill ends at each step with probability
-# 0.15; then either skill follows. There are 12 demonstrations of 24 steps. The control is the velocity.
+# A point on a line has two skills: move towards +1, and move towards −1. A skill ends at each step with
+# probability 0.15; then either skill follows. There are 12 demonstrations of 24 steps. The control is the
+# velocity.
 
 # %%
 random, N, T, SIGMA = np.random.default_rng(0), 12, 24, 0.2
@@ -78,9 +79,8 @@ demos = Demonstrations(
     tuple(Demonstration(f"demo_{n}", {"place": place[n]}, velocity[n], {"skill": skill[n]}) for n in range(N))
 )
 
-# %% [markdown]
-# The first fit is a point estimate by expectation-maximisation (EM). It has three linear options, one more than there
-# are skills. Its σ is in units of the controls' standard deviation.
+# %% [markdown] The first fit is a point estimate by expectation-maximisation (EM). It has three linear
+# options, one more than there are skills. Its σ is in units of the controls' standard deviation.
 
 # %%
 STD = SIGMA / velocity.std()
@@ -108,9 +108,9 @@ print("share of the steps by option:", fitted[..., 1:].mean((0, 1)).numpy().roun
 # %% [markdown]
 # ## The AHMM is a Pyro program
 #
-# `ahmm` samples terminations `b_1_t`, options `h_1_t` and controls `a_t` in a plate over demonstrations. Pyro itself
-# finds which site depends on which. The picture has the first four steps; observed sites are filled. Graphviz draws it
-# with `pyro.render_model`; where Graphviz is missing, networkx draws the same relations.
+# `ahmm` samples terminations `b_1_t`, options `h_1_t` and controls `a_t` in a plate over demonstrations. Pyro
+# itself finds which site depends on which. The picture has the first four steps; observed sites are filled.
+# Graphviz draws it with `pyro.render_model`; where Graphviz is missing, networkx draws the same relations.
 
 # %%
 program = (complete(tables, batch.lengths), outputs.emissions, batch.actions)
@@ -120,7 +120,9 @@ if which("dot") and find_spec("graphviz"):
     display(pyro.render_model(ahmm, model_args=short))
 else:
     relations = get_model_relations(ahmm, short)
-    graph = nx.DiGraph([(cause, site) for site, causes in relations["sample_sample"].items() for cause in causes])
+    graph = nx.DiGraph(
+        [(cause, site) for site, causes in relations["sample_sample"].items() for cause in causes]
+    )
     figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
     nx.draw_networkx(
         graph,
@@ -132,9 +134,8 @@ else:
     axes.axis("off")
     plt.show()
 
-# %% [markdown]
-# `EliminatedAHMM` is the same program with options and terminations summed out, as one distribution. Its `log_prob`,
-# the compiled kernel and `TraceEnum_ELBO` on the program give the same number.
+# %% [markdown] `EliminatedAHMM` is the same program with options and terminations summed out, as one
+# distribution. Its `log_prob`, the compiled kernel and `TraceEnum_ELBO` on the program give the same number.
 
 # %%
 eliminated = EliminatedAHMM(outputs, batch.lengths)
@@ -143,9 +144,9 @@ print(f"EliminatedAHMM {eliminated.log_prob(batch.actions).sum():.6f} nats")
 print(f"kernel         {log_likelihood(tables, batch.lengths).sum():.6f}")
 print(f"TraceEnum_ELBO {-enumerating.loss(ahmm, pyro.poutine.block(ahmm), *program):.6f}")
 
-# %% [markdown]
-# `infer_discrete` at temperature 0 gives the most likely path: that of the kernel's Viterbi pass. At temperature 1 it
-# draws paths; over 2000 draws for one demonstration the options are as frequent as the kernel's marginals say.
+# %% [markdown] `infer_discrete` at temperature 0 gives the most likely path: that of the kernel's Viterbi
+# pass. At temperature 1 it draws paths; over 2000 draws for one demonstration the options are as frequent as
+# the kernel's marginals say.
 
 # %%
 pyro.set_rng_seed(0)
@@ -177,10 +178,10 @@ plt.show()
 # %% [markdown]
 # ## Priors on the weights
 #
-# The weights of linear options get normal priors. Their standard deviations are those that EM's ridges stand for: a
-# ridge ρ is the precision of a normal prior, in units of 1/σ² for the policies. So a fit by EM is a mode of the
-# posterior density (MAP). One thing differs: EM leaves biases without a prior; here their prior is N(0, 1), so that the
-# posterior of an unused option is proper.
+# The weights of linear options get normal priors. Their standard deviations are those that EM's ridges stand
+# for: a ridge ρ is the precision of a normal prior, in units of 1/σ² for the policies. So a fit by EM is a
+# mode of the posterior density (MAP). One thing differs: EM leaves biases without a prior; here their prior
+# is N(0, 1), so that the posterior of an unused option is proper.
 
 # %%
 ridge = spec.training.optimizer.ridge
@@ -197,10 +198,9 @@ site = {name: name.replace(".", "_") for name in priors}
 start = {site[name]: weight.detach().clone() for name, weight in hierarchy.named_parameters()}
 bayesian = partial(bayesian_ahmm, hierarchy, priors)
 
-# %% [markdown]
-# EM stops where a step gains less than 1e-5 nats for each step of the demonstrations. From there, gradient ascent of
-# the log-likelihood plus the log-density of the prior on weights gains less than a nat, and moves weights by less than
-# their posterior standard deviations below.
+# %% [markdown] EM stops where a step gains less than 1e-5 nats for each step of the demonstrations. From
+# there, gradient ascent of the log-likelihood plus the log-density of the prior on weights gains less than a
+# nat, and moves weights by less than their posterior standard deviations below.
 
 # %%
 weights = {name: weight.detach().clone().requires_grad_() for name, weight in hierarchy.named_parameters()}
@@ -218,10 +218,9 @@ print(f"gain {values[-1] - values[0]:.3f} nats of {values[-1]:.1f}")
 print("largest change of a weight:", {name.replace(".network", "").replace(".layers.0", ""): round(change, 3)
                                       for name, change in moved.items()})  # fmt: skip
 
-# %% [markdown]
-# Three approximations of the posterior begin at EM's fit: independent normals (`AutoNormal`), a normal with a low-rank
-# covariance, and NUTS. Options can be exchanged, and the posterior has a mode for each numbering; a start at EM's fit
-# chooses one of them.
+# %% [markdown] Three approximations of the posterior begin at EM's fit: independent normals (`AutoNormal`), a
+# normal with a low-rank covariance, and NUTS. Options can be exchanged, and the posterior has a mode for each
+# numbering; a start at EM's fit chooses one of them.
 
 # %%
 samples = {}
@@ -233,7 +232,9 @@ for guided in (AutoNormal, AutoLowRankMultivariateNormal):
     losses = [svi.step(batch) for _ in range(600)]
     print(f"{guided.__name__}: ELBO {-np.mean(losses[-200:]):.1f} nats")
     with torch.no_grad():
-        samples[guided.__name__] = Predictive(bayesian, guide=guide, num_samples=300, return_sites=[*start])(batch)
+        samples[guided.__name__] = Predictive(bayesian, guide=guide, num_samples=300, return_sites=[*start])(
+            batch
+        )
 
 # %%
 pyro.set_rng_seed(0)
@@ -243,9 +244,9 @@ chain.run(batch)
 kept = chain.get_samples()
 print("divergences:", len(chain.diagnostics()["divergences"]["chain 0"]), "in", chain.num_samples, "draws")
 
-# %% [markdown]
-# A chain can still switch labels. Each draw gives the posterior of the options at every step; its options get the
-# numbers of the EM options that act at the same steps, one to one. The draw of a path, p(ζ | ξ, w), is for later.
+# %% [markdown] A chain can still switch labels. Each draw gives the posterior of the options at every step;
+# its options get the numbers of the EM options that act at the same steps, one to one. The draw of a path,
+# p(ζ | ξ, w), is for later.
 
 # %%
 paths, orders = [], []
@@ -273,17 +274,18 @@ for place_of, (name, drawn) in enumerate(samples.items()):
     low, middle, high = every.quantile(torch.tensor([0.05, 0.5, 0.95]).double(), dim=0)
     at = np.arange(every.shape[1]) + 0.2 * (place_of - 1)
     axes.errorbar(at, middle, (middle - low, high - middle), fmt="o", markersize=4, label=name)
-labels = [f"{symbol} {kind} {option}" for symbol in "πψη" for kind in ("weight", "bias") for option in (1, 2, 3)]
+labels = [
+    f"{symbol} {kind} {option}" for symbol in "πψη" for kind in ("weight", "bias") for option in (1, 2, 3)
+]
 axes.set_xticks(range(18), labels, rotation=60)
 axes.set_title("weights and biases by option: median and 90 % interval")
 axes.legend()
 plt.show()
 
-# %% [markdown]
-# The policies of options 2 and 3 are known well, and the three approximations agree on them. Terminations and the
-# meta-policy are known less well: a demonstration has few switches. `AutoNormal` knows no correlations, and most of its
-# intervals for ψ and η of options 2 and 3 are narrower than those of NUTS. Where the chain has few effective draws, its
-# intervals are rough.
+# %% [markdown] The policies of options 2 and 3 are known well, and the three approximations agree on them.
+# Terminations and the meta-policy are known less well: a demonstration has few switches. `AutoNormal` knows
+# no correlations, and most of its intervals for ψ and η of options 2 and 3 are narrower than those of NUTS.
+# Where the chain has few effective draws, its intervals are rough.
 #
 # ## How many options are used?
 #
@@ -294,19 +296,21 @@ shares = (paths[..., None] == [1, 2, 3]).mean((1, 2))
 for least in (0.0, 0.02, 0.05, 0.1):
     three = torch.from_numpy((shares > least).all(1)).double()
     error = 0.0 if three.std() == 0 else three.std() / effective_sample_size(three[None]) ** 0.5
-    print(f"three options with more than {least:3.0%} of the steps: P = {three.mean():.2f}, standard error {error:.2f}")
+    print(
+        f"three options with more than {least:3.0%} of the steps: P = {three.mean():.2f}, standard error {error:.2f}"
+    )
 
-# %% [markdown]
-# There are two skills. Nothing in these priors prefers few options, and many draws give a few steps to a third one. It
-# seldom has a tenth of the steps. The chain moves slowly between weights with much and with little use of it: the
-# standard errors say how well their shares are known.
+# %% [markdown] There are two skills. Nothing in these priors prefers few options, and many draws give a few
+# steps to a third one. It seldom has a tenth of the steps. The chain moves slowly between weights with much
+# and with little use of it: the standard errors say how well their shares are known.
 #
 # ## Predictive checks
 #
-# The parts of the program, `choose` and `Acting`, also act: each draw of weights controls the point for 12 new
-# demonstrations from the recorded first places. Two statistics are compared. The correlation of successive controls has
-# a measured value. The duration of segments is latent: new paths are compared, draw by draw, with paths given the
-# recorded controls. The same weights with options that end after every step are a model that has to fail.
+# The parts of the program, `choose` and `Acting`, also act: each draw of weights controls the point for 12
+# new demonstrations from the recorded first places. Two statistics are compared. The correlation of
+# successive controls has a measured value. The duration of segments is latent: new paths are compared, draw
+# by draw, with paths given the recorded controls. The same weights with options that end after every step are
+# a model that has to fail.
 
 # %%
 pyro.set_rng_seed(1)
@@ -319,7 +323,10 @@ for name in ("drawn anew", "drawn anew, memoryless"):
     for t in range(T):
         x = torch.from_numpy(hierarchy.encoder.scaled(here)).float()
         normal = Gaussian((policy * x + policy_bias)[:, None, :, None], torch.tensor([STD]), torch.zeros(1))
-        callers = CallerOutputs(0, None, normal), CallerOutputs(3, (meta * x + meta_bias)[:, None, None], None)
+        callers = (
+            CallerOutputs(0, None, normal),
+            CallerOutputs(3, (meta * x + meta_bias)[:, None, None], None),
+        )
         ending = (termination * x + termination_bias)[:, None] if name == "drawn anew" else None
         now = complete(Outputs(callers, (ending,)).tables(), torch.ones(D * N, dtype=torch.long)).steps()[0]
         options = choose(t, now, options)
@@ -349,14 +356,14 @@ for name, values in correlations.items():
     print(f"{name:23} P(longer than given the controls) = {longer:.2f}, "
           f"P(correlation above the measured) = {(values > measured).mean():.2f}")  # fmt: skip
 
-# %% [markdown]
-# Options that last pass both checks, and memoryless ones fail both. Segments given the controls are shorter than the
-# true ones, because the third option divides some of them.
+# %% [markdown] Options that last pass both checks, and memoryless ones fail both. Segments given the controls
+# are shorter than the true ones, because the third option divides some of them.
 #
 # ## Boundaries have intervals
 #
-# `fit.draws` draws whole paths at EM's weights. `draws.boundaries` has, for each boundary of the most likely path, the
-# share of draws that have it and an interval of 90 %. `draws.to_datatree()` gives the draws to xarray and ArviZ.
+# `fit.draws` draws whole paths at EM's weights. `draws.boundaries` has, for each boundary of the most likely
+# path, the share of draws that have it and an interval of 90 %. `draws.to_datatree()` gives the draws to
+# xarray and ArviZ.
 
 # %%
 draws = mine.draws(demos, draws=500)
@@ -374,28 +381,35 @@ plt.show()
 # %% [markdown]
 # ## Simulation-based calibration
 #
-# Weights are drawn from the prior, controls from the model with these weights. The rank of the weights among draws
-# from their posterior is then uniform, if and only if prior, model and posterior fit together. One posterior for each
-# of 400 replications would take NUTS hours, so the prior here is uniform over 150 candidates drawn from normals. The
-# first candidate generates the controls. The posterior over candidates is exact: the softmax of `log_prob`.
+# Weights are drawn from the prior, controls from the model with these weights. The rank of the weights among
+# draws from their posterior is then uniform, if and only if prior, model and posterior fit together. One
+# posterior for each of 400 replications would take NUTS hours, so the prior here is uniform over 150
+# candidates drawn from normals. The first candidate generates the controls. The posterior over candidates is
+# exact: the softmax of `log_prob`.
 #
-# `EliminatedAHMM` takes the outputs of any networks. Here they are written by hand: two linear options for each
-# replication and candidate, with constant terminations and meta-policy.
+# `EliminatedAHMM` takes the outputs of any networks. Here they are written by hand: two linear options for
+# each replication and candidate, with constant terminations and meta-policy.
 
 # %%
 pyro.set_rng_seed(3)
 R, M, STEPS = 400, 150, 15
-center = torch.tensor([0.0, 0.0, 1.0, -1.0, -1.0, -1.0, 0.0])  # slopes, biases, ψ and η: options cannot be exchanged
+center = torch.tensor(
+    [0.0, 0.0, 1.0, -1.0, -1.0, -1.0, 0.0]
+)  # slopes, biases, ψ and η: options cannot be exchanged
 candidates = center + 0.6 * torch.randn(R, M, 7)
 slope, bias, ending, first = candidates.reshape(R * M, 1, 7).split([2, 2, 2, 1], dim=-1)
 states = torch.randn(R, 1, STEPS, 1).expand(R, M, STEPS, 1).reshape(R * M, STEPS, 1)
 lengths = torch.full((R * M,), STEPS)
-options = CallerOutputs(0, None, Gaussian((slope * states + bias).unsqueeze(-1), torch.tensor([0.5]), torch.zeros(1)))
+options = CallerOutputs(
+    0, None, Gaussian((slope * states + bias).unsqueeze(-1), torch.tensor([0.5]), torch.zeros(1))
+)
 choice = CallerOutputs(2, torch.cat([first, -first], -1).unsqueeze(2).expand(-1, STEPS, 1, 2), None)
 ended = ending.expand(-1, STEPS, 2)
 lasting = EliminatedAHMM(Outputs((options, choice), (ended,)), lengths)
 memoryless = EliminatedAHMM(Outputs((options, choice), (None,)), lengths)
-simulated = lasting.sample().float().reshape(R, M, STEPS, 1)[:, :1].expand(R, M, STEPS, 1).reshape(R * M, STEPS, 1)
+simulated = (
+    lasting.sample().float().reshape(R, M, STEPS, 1)[:, :1].expand(R, M, STEPS, 1).reshape(R * M, STEPS, 1)
+)
 
 figure, panels = plt.subplots(1, 2, figsize=(10, 2.8), sharey=True, layout="constrained")
 for axes, name, model in zip(panels, ("EliminatedAHMM", "memoryless"), (lasting, memoryless), strict=True):
@@ -412,6 +426,5 @@ for axes, name, model in zip(panels, ("EliminatedAHMM", "memoryless"), (lasting,
 panels[0].legend()
 plt.show()
 
-# %% [markdown]
-# The p-values are those of seven weights and of the log-likelihood. With the right model none is small. A posterior
-# with memoryless options is rejected.
+# %% [markdown] The p-values are those of seven weights and of the log-likelihood. With the right model none
+# is small. A posterior with memoryless options is rejected.

@@ -3,9 +3,9 @@
     python -m studies run|status|report studies/NAME.yaml [--out FOLDER] [--jobs 2]
     python -m studies render [--check] README.md docs/results/*.md
 
-``run`` does the cells that are not done, and may be killed and called again. ``status`` counts cells. ``report`` writes
-``table.csv`` and prints contrasts and means. ``render`` brings the generated tables of pages up to date; with
-``--check`` it changes nothing, and fails where a page differs.
+``run`` does the cells that are not done, and may be killed and called again. ``status`` counts cells.
+``report`` writes ``table.csv`` and prints contrasts and means. ``render`` brings the generated tables of
+pages up to date; with ``--check`` it changes nothing, and fails where a page differs.
 """
 
 from __future__ import annotations
@@ -72,7 +72,9 @@ def told(folder: Folder, state: State) -> Iterator[str]:
     ):
         if found:
             yield f"{what}: {', '.join(f'{name} ({count})' for name, count in found.items())}"
-    chosen = dict.fromkeys(declared.label(cell.of, cell.point, "") for cell in state.cells if cell.part == "test")
+    chosen = dict.fromkeys(
+        declared.label(cell.of, cell.point, "") for cell in state.cells if cell.part == "test"
+    )
     if declared.choose and chosen:
         yield f"the points with the highest {declared.choose} in development: {', '.join(chosen)}"
     yield f"{len(state.done)} of {len(state.cells)} cells are done"

@@ -1,7 +1,8 @@
-"""A simulator that needs other packages than this project: an environment of its own, and the module that runs in it.
+"""A simulator that needs other packages than this project: an environment of its own, and the module that
+runs in it.
 
-A module has two commands: ``collect TASK OUT.hdf5`` records demonstrations (``arena_recording.py``), and ``play TASK
-OUT.json NAME=EXPORTED...`` lets exported controllers act (``arena_playing.py``).
+A module has two commands: ``collect TASK OUT.hdf5`` records demonstrations (``arena_recording.py``), and
+``play TASK OUT.json NAME=EXPORTED...`` lets exported controllers act (``arena_playing.py``).
 """
 
 from __future__ import annotations
@@ -69,10 +70,24 @@ class Apart:
         :raises Failed: it cannot be made.
         """
         folder, pins = self.runs / "venv", HERE / self.pins
-        python, marker, wanted = folder / "bin" / "python", folder / INSTALLED, pins.read_text(encoding="utf-8")
+        python, marker, wanted = (
+            folder / "bin" / "python",
+            folder / INSTALLED,
+            pins.read_text(encoding="utf-8"),
+        )
         with only_one(folder, wait=True):
             if not marker.exists() or marker.read_text(encoding="utf-8") != wanted:
-                pip = [str(python), "-m", "pip", "install", "-q", "--no-compile", "--no-deps", "-r", str(pins)]
+                pip = [
+                    str(python),
+                    "-m",
+                    "pip",
+                    "install",
+                    "-q",
+                    "--no-compile",
+                    "--no-deps",
+                    "-r",
+                    str(pins),
+                ]
                 for command in ([sys.executable, "-m", "venv", "--clear", str(folder)], pip):
                     _run(command, f"{folder}: an environment with {pins.name} cannot be made")
                 write_text(marker, wanted)
@@ -97,7 +112,9 @@ class Apart:
         with tempfile.TemporaryDirectory() as folder:
             for name, one in methods.items():
                 (Path(folder) / name).mkdir()
-                write_numpy(one, Path(folder) / name) if isinstance(one, Fit) else one.write(Path(folder) / name)
+                write_numpy(one, Path(folder) / name) if isinstance(one, Fit) else one.write(
+                    Path(folder) / name
+                )
             out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
             self.run("play", task, out, *named, **options)
             return dict(json.loads(out.read_text()))
@@ -108,8 +125,19 @@ class Apart:
         :raises BadInput: it says that what it was given cannot be used; its last line.
         :raises Failed: it ended with another error; its last line.
         """
-        module = [str(self.made()), "-W", "ignore", "-P", "-m", f"studies.{Path(self.script).stem}", what, task]
-        words = [word for key, value in options.items() for word in (f"--{key.replace('_', '-')}", str(value))]
+        module = [
+            str(self.made()),
+            "-W",
+            "ignore",
+            "-P",
+            "-m",
+            f"studies.{Path(self.script).stem}",
+            what,
+            task,
+        ]
+        words = [
+            word for key, value in options.items() for word in (f"--{key.replace('_', '-')}", str(value))
+        ]
         _run([*module, *map(str, arguments), *words], f"{self.script} {what} {task}")
 
 
@@ -120,7 +148,9 @@ def _run(command: list[str], what: str) -> None:
     except OSError as error:
         raise Failed(f"{what}: {command[0]}: {error.strerror}") from error
     if ended.returncode:
-        said = (ended.stderr.strip() or ended.stdout.strip() or f"exit status {ended.returncode}").splitlines()
+        said = (
+            ended.stderr.strip() or ended.stdout.strip() or f"exit status {ended.returncode}"
+        ).splitlines()
         raise (BadInput if ended.returncode == BAD_INPUT else Failed)(f"{what}: {said[-1].strip()}")
 
 
@@ -131,7 +161,9 @@ class Peers(ABC):
         self.methods = {name: partial(self._policy, settings) for name, settings in KINDS.items()}
 
     @abstractmethod
-    def play(self, task: str, fitted: Fit | Policy, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
+    def play(
+        self, task: str, fitted: Fit | Policy, starts: range, folder: Path
+    ) -> Sequence[Mapping[str, float]]:
         """Episodes of a policy: success, and what else the simulator measures."""
 
     def _policy(self, settings: Settings, job: Job) -> dict[str, float]:
@@ -165,10 +197,14 @@ class World(Peers):
         """Settings are ``chunk``, ``executed``, and key paths of the spec."""
         spec = {key: value for key, value in job.settings.items() if "." in key}
         chunk, executed = job.settings["chunk"], job.settings["executed"]
-        fitted = fit_spec(with_overrides(job.spec, spec), chunked(job.demos, chunk), out=job.folder / "fit", keep=False)
+        fitted = fit_spec(
+            with_overrides(job.spec, spec), chunked(job.demos, chunk), out=job.folder / "fit", keep=False
+        )
         return means(self.play(job.cell.task, Chunked(fitted, chunk, executed), job.starts, job.folder))
 
-    def play(self, task: str, fitted: Fit | Written, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
+    def play(
+        self, task: str, fitted: Fit | Written, starts: range, folder: Path
+    ) -> Sequence[Mapping[str, float]]:
         """Episodes of the exported policy: success, steps, and what else the simulator measures."""
         played = self.simulator.played(task, {"policy": fitted}, first=starts.start, episodes=len(starts))
         return [{name: float(value) for name, value in one.items()} for one in played["episodes"]["policy"]]

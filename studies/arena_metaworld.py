@@ -3,9 +3,10 @@
     python -m studies.arena_metaworld collect TASK OUT.hdf5 [--number 70] [--held-out 20] [--noise 0.1]
     python -m studies.arena_metaworld play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--first SEED]
 
-``collect`` records the scripted expert, executed with normal noise on every control; of each step its phase is the
-return statement by which the expert's ``_desired_pos`` ended, or the assignment of ``delta_pos`` where it has none.
-``play`` lets exported controllers act from initial states that were never demonstrated, the same for all.
+``collect`` records the scripted expert, executed with normal noise on every control; of each step its phase
+is the return statement by which the expert's ``_desired_pos`` ended, or the assignment of ``delta_pos`` where
+it has none. ``play`` lets exported controllers act from initial states that were never demonstrated, the same
+for all.
 """
 
 from __future__ import annotations
@@ -97,7 +98,13 @@ def demonstrate(world: Sawyer, expert: Any, phases: Phases, seed: int, noise: fl
 
 
 def collect(
-    task: str, out: Path, number: int, held_out: int, noise: float, first: int = 0, attempts: int | None = None
+    task: str,
+    out: Path,
+    number: int,
+    held_out: int,
+    noise: float,
+    first: int = 0,
+    attempts: int | None = None,
 ) -> None:
     """Record the first successful episodes from seed ``first`` on."""
     world, expert = Sawyer(task), ENV_POLICY_MAP[task]()
@@ -129,7 +136,10 @@ def main() -> None:
     own = parser.parse_args()
     warnings.filterwarnings("ignore")  # the experts' gains are meant to saturate
     if own.task not in ENV_POLICY_MAP:
-        print(f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}", file=sys.stderr)
+        print(
+            f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}",
+            file=sys.stderr,
+        )
         raise SystemExit(2)
     if own.what == "collect":
         collect(own.task, own.out, own.number, own.held_out, own.noise, own.first or 0, own.attempts)

@@ -12,7 +12,8 @@ from typing import Any
 
 
 class Phases:
-    """The return statements of a function, 0 to P − 1 in the order of their lines, and which of them a call reached.
+    """The return statements of a function, 0 to P − 1 in the order of their lines, and which of them a call
+    reached.
 
     The function is not changed: while it runs it is traced, and what returns is told by its line.
 
@@ -22,21 +23,28 @@ class Phases:
     """
 
     def __init__(self, function: Callable[..., Any], key: str | None = None) -> None:
-        self._event, kind = ("return", "return statement") if key is None else ("line", f"assignment to {key!r}")
+        self._event, kind = (
+            ("return", "return statement") if key is None else ("line", f"assignment to {key!r}")
+        )
         self._code: CodeType = inspect.unwrap(function).__code__
         lines, first = inspect.getsourcelines(self._code)
         tree = ast.parse(textwrap.dedent("".join(lines)))
-        returns = sorted((node.lineno, node.end_lineno or node.lineno) for node in _decisive(tree.body[0], key))
+        returns = sorted(
+            (node.lineno, node.end_lineno or node.lineno) for node in _decisive(tree.body[0], key)
+        )
         if not returns:
             raise ValueError(f"{function.__qualname__} has no {kind}")
         self.lines = [first + start - 1 for start, _ in returns]
         self._phase = {
-            first + line - 1: number for number, (start, end) in enumerate(returns) for line in range(start, end + 1)
+            first + line - 1: number
+            for number, (start, end) in enumerate(returns)
+            for line in range(start, end + 1)
         }
         self._last: int | None = None
 
     def of(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int]:
-        """What ``call(*arguments)`` returns, and the phase in which the function, called by it last, returned.
+        """What ``call(*arguments)`` returns, and the phase in which the function, called by it last,
+        returned.
 
         :raises LookupError: the function was not called.
         """
@@ -65,5 +73,9 @@ def _decisive(node: ast.AST, key: str | None) -> list[ast.stmt]:
     children = [child for child in ast.iter_child_nodes(node) if not isinstance(child, inner)]
     own = [child for child in children if isinstance(child, ast.Return if key is None else ast.Assign)]
     if key is not None:
-        own = [one for one in own if isinstance(one, ast.Assign) and ast.unparse(one.targets[0]).endswith(f"[{key!r}]")]
+        own = [
+            one
+            for one in own
+            if isinstance(one, ast.Assign) and ast.unparse(one.targets[0]).endswith(f"[{key!r}]")
+        ]
     return [*own, *(found for child in children for found in _decisive(child, key))]

@@ -56,7 +56,8 @@ def named_controllers(named: Iterable[str]) -> dict[str, Any]:
 def exported(folder: str | Path) -> Any:
     """The ``Runner`` of an exported controller, by the ``runner.py`` that was exported beside it.
 
-    With a ``chunk.json`` beside it (:func:`write_chunk`), the controller gives chunks of actions (:class:`Chunks`).
+    With a ``chunk.json`` beside it (:func:`write_chunk`), the controller gives chunks of actions
+    (:class:`Chunks`).
     """
     path = Path(folder) / "runner.py"
     spec = importlib.util.spec_from_file_location("exported_runner", path)
@@ -65,7 +66,11 @@ def exported(folder: str | Path) -> Any:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     beside = path.with_name("chunk.json")
-    return Chunks(module.Runner(folder), **json.loads(beside.read_text())) if beside.exists() else module.Runner(folder)
+    return (
+        Chunks(module.Runner(folder), **json.loads(beside.read_text()))
+        if beside.exists()
+        else module.Runner(folder)
+    )
 
 
 def write_chunk(folder: Path, chunk: int, executed: int) -> None:
@@ -77,8 +82,8 @@ class Chunks:
     """Acts by a controller of chunks of actions, which sees every observation.
 
     :param chunk: steps of a chunk.
-    :param executed: steps of a chunk that are executed before another one. 0: each step has the mean of what the last
-        chunks say of it, the older the heavier (temporal ensembling: ACT, Zhao et al. 2023).
+    :param executed: steps of a chunk that are executed before another one. 0: each step has the mean of what
+        the last chunks say of it, the older the heavier (temporal ensembling: ACT, Zhao et al. 2023).
     """
 
     DECAY = 0.01
@@ -119,7 +124,9 @@ def play(controller: Any, environment: Environment, seed: int) -> dict[str, Any]
     return {"success": success, "steps": steps, **environment.outcome}
 
 
-def play_all(environment: Environment, out: Path, controllers: Mapping[str, Any], seeds: Sequence[int]) -> None:
+def play_all(
+    environment: Environment, out: Path, controllers: Mapping[str, Any], seeds: Sequence[int]
+) -> None:
     """Episodes of each controller, as JSON."""
     played = {name: [play(one, environment, seed) for seed in seeds] for name, one in controllers.items()}
     out.write_text(json.dumps({"episodes": played}))

@@ -1,6 +1,7 @@
 """Cells of a study: one fit each, with its rollouts, kept as soon as it is done.
 
-The folder of a study holds results (``cells/KEY.json``), fits (``work/KEY``) and ``demonstrations``. It may be moved.
+The folder of a study holds results (``cells/KEY.json``), fits (``work/KEY``) and ``demonstrations``. It may
+be moved.
 """
 
 from __future__ import annotations
@@ -66,15 +67,23 @@ def kept(path: Path, depends: Mapping[str, Any] | None) -> Done | None:
     return done if depends is None or done.depends == json.loads(json.dumps(depends)) else None
 
 
-def do(path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], code: str = "") -> str:
+def do(
+    path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], code: str = ""
+) -> str:
     """Do a cell on one thread, unless another process does, and keep its results in ``path``; returns why it failed."""
     folder = path.parents[1] / "work" / path.stem
     try:
         with only_one(folder):
-            if (before := kept(path, depends)) is not None and not before.failed:  # another process has done it
+            if (
+                before := kept(path, depends)
+            ) is not None and not before.failed:  # another process has done it
                 return ""
             begun = folder / "code"
-            if (path.exists() and before is None) or not begun.exists() or begun.read_text(encoding="utf-8") != code:
+            if (
+                (path.exists() and before is None)
+                or not begun.exists()
+                or begun.read_text(encoding="utf-8") != code
+            ):
                 shutil.rmtree(folder / "fit", ignore_errors=True)  # of other defaults or of another commit
             write_text(begun, code)
             try:
@@ -89,7 +98,9 @@ def do(path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[st
         return ""
 
 
-def do_all(calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, on_event: OnEvent = ignore) -> None:
+def do_all(
+    calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, on_event: OnEvent = ignore
+) -> None:
     """Make the calls of :func:`do`, by the name of the cell; ``kept`` other cells are done already."""
     on_event(CellsBegan("study", len(calls) + kept, kept))
     with run_all(calls, workers, "did a cell") as done:
@@ -174,7 +185,9 @@ class Folder:
         """The cells of a part, with all points of the grid or the chosen ones; a training seed before another."""
         declared, block = self.study.declared, getattr(self.study.declared.seeds, part)
         return [
-            Cell(part, task, declared.label(name, point, part), count, block.first + place, name, point, place)
+            Cell(
+                part, task, declared.label(name, point, part), count, block.first + place, name, point, place
+            )
             for place in range(block.count)
             for count in declared.demonstrations.counts
             for task in (part != "test" and declared.choose_on) or declared.tasks
@@ -194,8 +207,12 @@ class Folder:
         known = {cell: one for cell in cells if (one := self.kept(cell))}
         codes = dict.fromkeys(one.code for one in known.values())
         if self.study.declared.pinned and len(codes) > 1:
-            raise BadInput(f"{self.study.path}: pinned: results are of commits {', '.join(codes)}; keep those of one")
-        done, failed = ({cell: one for cell, one in known.items() if bool(one.failed) is way} for way in (False, True))
+            raise BadInput(
+                f"{self.study.path}: pinned: results are of commits {', '.join(codes)}; keep those of one"
+            )
+        done, failed = (
+            {cell: one for cell, one in known.items() if bool(one.failed) is way} for way in (False, True)
+        )
         if values := self.study.declared.failed:
             failed = {cell: one.model_copy(update={"values": values}) for cell, one in failed.items()}
         return State(cells, done, failed)
@@ -210,7 +227,9 @@ class Folder:
         def mean(name: str, point: dict[str, Any]) -> float:
             return float(np.mean(scores[declared.label(name, point, "development")]))
 
-        return {name: max(method.points, key=partial(mean, name)) for name, method in declared.methods.items()}
+        return {
+            name: max(method.points, key=partial(mean, name)) for name, method in declared.methods.items()
+        }
 
     def kept(self, cell: Cell) -> Done | None:
         """The results of a cell, if it is done: here, or in the declaration's tables ``kept``."""
@@ -261,7 +280,9 @@ class Folder:
             spec = with_overrides(study.base, {**given, **_placed(cell, "demonstrations.hdf5")})
             baseline = baseline and named_baselines(spec).get(baseline.kind, baseline)
             shown = {"report", "selection", "compare_with"}  # what a result does not depend on
-            given, added = (spec.model_dump(mode="json", exclude=shown, exclude_defaults=own) for own in (True, False))
+            given, added = (
+                spec.model_dump(mode="json", exclude=shown, exclude_defaults=own) for own in (True, False)
+            )
         return {
             "baseline": baseline and baseline.model_dump(exclude_unset=True, mode="json"),
             "by": method.by,
@@ -306,7 +327,9 @@ class Folder:
         if pinned and code.endswith(DIRTY):
             text = f"the code has changes since {code.removesuffix(DIRTY)}; commit them"
         elif pinned and others and len(state.done) < len(state.cells):
-            text = f"results are of commit {others.pop()}, here is {code}; run it at that commit, or remove them"
+            text = (
+                f"results are of commit {others.pop()}, here is {code}; run it at that commit, or remove them"
+            )
         else:
             return
         raise BadInput(f"{self.study.path}: pinned: {text}")
@@ -349,7 +372,9 @@ class Folder:
         valid, rest = names[:held_out], names[held_out:]
         train, unused = rest[: cell.demonstrations], rest[cell.demonstrations :]
         if (base := study.base) is None:
-            facts = replace(inspect(file, exclude=[*valid, *unused]), excluded=(), masks={})  # no others are shown
+            facts = replace(
+                inspect(file, exclude=[*valid, *unused]), excluded=(), masks={}
+            )  # no others are shown
             base = parse_spec(read_yaml(starting_spec(facts, file).text))
         placed = _placed(cell, file.relative_to(self.path).as_posix())
         spec = with_overrides(base, {**study.changes(cell.of, cell.point), **placed})
@@ -368,4 +393,7 @@ class Folder:
 def _placed(cell: Cell, path: str) -> dict[str, Any]:
     """What a spec says of a cell's data, by key path. The path is relative: the study's folder may move."""
     own = {"path": path, "exclude": [], "count": max(2, cell.demonstrations), "seed": 0}
-    return {f"demonstrations.{key}": value for key, value in own.items()} | {"training.seed": None, "seed": cell.seed}
+    return {f"demonstrations.{key}": value for key, value in own.items()} | {
+        "training.seed": None,
+        "seed": cell.seed,
+    }

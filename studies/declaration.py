@@ -23,7 +23,10 @@ from ddco_pyro.spec.yaml import read_mapping
 SKELETON = {
     "demonstrations": {"path": "none.hdf5"},
     "observations": ["none"],
-    "hierarchy": {"levels": [{"count": 2, "policy": {"network": "linear"}}], "meta_policy": {"network": "linear"}},
+    "hierarchy": {
+        "levels": [{"count": 2, "policy": {"network": "linear"}}],
+        "meta_policy": {"network": "linear"},
+    },
 }
 """A spec like those of ``init``, in which overrides are checked before there are demonstrations."""
 
@@ -180,8 +183,14 @@ class Declaration(Model):
             both = method.by is not None and method.baseline is not None
             yield both, f"methods.{name}.baseline", "stands beside by; keep one of the two"
             for path in method.overrides.keys() & method.grid.keys():
-                yield True, f"methods.{name}.overrides", f"has {path!r}, which the grid has, too; keep one of the two"
-        yield from ((name not in self.measures, f"failed.{name}", f"{name!r} {AMONG}") for name in self.failed)
+                yield (
+                    True,
+                    f"methods.{name}.overrides",
+                    f"has {path!r}, which the grid has, too; keep one of the two",
+                )
+        yield from (
+            (name not in self.measures, f"failed.{name}", f"{name!r} {AMONG}") for name in self.failed
+        )
 
     def _chosen(self) -> Iterator[tuple[bool, str, str]]:
         choose, none = self.choose, self.choose is None
@@ -191,12 +200,22 @@ class Declaration(Model):
         for number, task in enumerate(self.choose_on):
             text = f"{task!r} is not among tasks, or there is nothing to choose; remove it"
             yield none or task not in self.tasks, f"choose_on.{number}", text
-        trials = {name: len({point_name(point) for point in one.points}) for name, one in self.methods.items()}
-        yield none and {*trials.values()} != {1}, "choose", "missing; name the measure that chooses among the points"
+        trials = {
+            name: len({point_name(point) for point in one.points}) for name, one in self.methods.items()
+        }
+        yield (
+            none and {*trials.values()} != {1},
+            "choose",
+            "missing; name the measure that chooses among the points",
+        )
         counts = ", ".join(f"{name} {count}" for name, count in trials.items())
         text = f"have unequal numbers of points to choose from ({counts}); name as many for each"
         yield not none and len({*trials.values()}) > 1, "methods", text
-        yield not none and {*trials.values()} == {1}, "methods", "have nothing to choose from; give each a grid"
+        yield (
+            not none and {*trials.values()} == {1},
+            "methods",
+            "have nothing to choose from; give each a grid",
+        )
 
     def label(self, method: str, point: dict[str, Any], part: str = "test") -> str:
         """The name of a method in tables: in the development with the point of the grid."""
@@ -219,10 +238,14 @@ class Study:
         except ValidationError as error:
             raise SpecError(*(f"{path}: {line}" for line in lines(error, Declaration))) from None
         study = cls(
-            path, declared, None if declared.spec == "init" else load_spec(path.parent / declared.spec, (), True)
+            path,
+            declared,
+            None if declared.spec == "init" else load_spec(path.parent / declared.spec, (), True),
         )
         given: Any = SKELETON if study.base is None else study.base.model_dump(exclude_unset=True)
-        for name, point in [(name, point) for name, method in declared.methods.items() for point in method.points]:
+        for name, point in [
+            (name, point) for name, method in declared.methods.items() for point in method.points
+        ]:
             try:
                 parse_spec(given, study.changes(name, point))
             except SpecError as error:

@@ -1,6 +1,7 @@
 """Generated tables of pages, as ``docs/studies.md`` describes them, and the report of a study.
 
-Between ``<!-- table: PAGE/NAME -->`` and ``<!-- end -->`` stands the table ``## NAME`` of ``studies/tables/PAGE.md``.
+Between ``<!-- table: PAGE/NAME -->`` and ``<!-- end -->`` stands the table ``## NAME`` of
+``studies/tables/PAGE.md``.
 """
 
 from __future__ import annotations
@@ -64,7 +65,10 @@ SHOWN: dict[str, Callable[[Estimate, str], str]] = {
 
 def render(text: str) -> str:
     """A page's text with its generated tables as the results have them; raises BadInput if one is not there."""
-    numbers, templates = Numbers(), {match.groups(): template(*match.groups()) for match in BLOCK.finditer(text)}
+    numbers, templates = (
+        Numbers(),
+        {match.groups(): template(*match.groups()) for match in BLOCK.finditer(text)},
+    )
     for one in templates.values():
         NUMBER.sub(numbers.shown, one)  # finds the families of differences
     numbers.judge()
@@ -79,7 +83,9 @@ def render(text: str) -> str:
 def template(place: str, name: str) -> str:
     """A table before its numbers are there; raises BadInput if there is none."""
     path = STUDIES / "tables" / f"{place}.md"
-    parts = re.split(r"^## (\w+)\n", path.read_text(encoding="utf-8") if path.exists() else "", flags=re.MULTILINE)
+    parts = re.split(
+        r"^## (\w+)\n", path.read_text(encoding="utf-8") if path.exists() else "", flags=re.MULTILINE
+    )
     known = dict(zip(parts[1::2], parts[2::2], strict=True))
     if name not in known:
         raise BadInput(f"{path}: has no table {name!r}{nearest(name, known)}; add it under: ## {name}")
@@ -133,7 +139,9 @@ class Numbers:
             numbers = tuple(count.split(" - "))
             cells = [self._number((source, what, measure, numbers, task), settings, alone) for what in whats]
             if any(cells):
-                rows.append([str(task), " − ".join(numbers), name_of(measure), *(text or "–" for text in cells)])
+                rows.append(
+                    [str(task), " − ".join(numbers), name_of(measure), *(text or "–" for text in cells)]
+                )
         if not rows:
             raise BadInput(f"{match[0]}: there is no such number; check its names")
         head = ["task", "demonstrations", "measure", *(what.replace(" - ", " − ") for what in whats)]
@@ -180,13 +188,34 @@ def report(folder: Folder, state: State) -> str:
     write_text(folder.path / "table.csv", table.to_csv(index=False, lineterminator="\n", float_format="%.9g"))
     rows, means = list[list[str]](), list[list[str]]()
     for one in tested(study, table):
-        numbers = [SHOWN[show](one.estimate, "+.2f") for show in ("interval", "median")] if one.estimate else ["–"] * 2
-        facts = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations), one.spec.kind, one.verdict]
+        numbers = (
+            [SHOWN[show](one.estimate, "+.2f") for show in ("interval", "median")]
+            if one.estimate
+            else ["–"] * 2
+        )
+        facts = [
+            one.spec.contrast,
+            name_of(one.spec.measure),
+            str(one.demonstrations),
+            one.spec.kind,
+            one.verdict,
+        ]
         rows.append([*facts, *numbers, "–" if one.verdict == NOT_TESTED else words.p_value(one.adjusted)])
-    head = ["contrast", "measure", "demonstrations", "kind", "verdict", "mean [95 % t]", "median [95 %]", "adjusted p"]
+    head = [
+        "contrast",
+        "measure",
+        "demonstrations",
+        "kind",
+        "verdict",
+        "mean [95 % t]",
+        "median [95 %]",
+        "adjusted p",
+    ]
     tables = [Table(head, rows, {0, 1, 3, 4}).markdown()] if rows else []
     for count, method in product(declared.demonstrations.counts, declared.methods):
         own = [estimated(study, table, method, measure, [count]) for measure in declared.measures]
         means.append([str(count), method, *(shown(known) if known else "–" for known in own)])
-    tables.append(Table(["demonstrations", "method", *map(name_of, declared.measures)], means, {1}).markdown())
+    tables.append(
+        Table(["demonstrations", "method", *map(name_of, declared.measures)], means, {1}).markdown()
+    )
     return "\n\n".join([f"# Study {study.path.stem}", declared.question, *tables])

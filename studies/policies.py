@@ -5,9 +5,10 @@
     control = policy.act(observation)    # [A]
     policy.write(folder)                 # for a simulator with numpy alone
 
-``bc`` is behaviour cloning by a perceptron. ``chunks`` gives chunks of controls and acts by temporal ensembling, as ACT
-does (Zhao et al. 2023). ``flow`` draws chunks of controls by flow matching, as a diffusion policy does (Chi et al.
-2023): from two observations, with averaged weights, and half of a chunk is executed. ``lstm`` remembers.
+``bc`` is behaviour cloning by a perceptron. ``chunks`` gives chunks of controls and acts by temporal
+ensembling, as ACT does (Zhao et al. 2023). ``flow`` draws chunks of controls by flow matching, as a diffusion
+policy does (Chi et al. 2023): from two observations, with averaged weights, and half of a chunk is executed.
+``lstm`` remembers.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ class Settings:
     :param history: observations that the policy sees.
     :param power: of the error: 1 (L1) or 2 (squared).
     :param steps: gradient steps, the same for all policies.
-    :param batch: steps of demonstrations in a gradient step; whole demonstrations of about so many for an LSTM.
+    :param batch: steps of demonstrations in a gradient step; whole demonstrations of about so many for an
+        LSTM.
     :param rate: learning rate, which falls to 0 by a cosine.
     :param decay: of weights.
     :param averaged: decay of the moving average of the weights, with which the policy acts; 0: the last ones.
@@ -69,7 +71,9 @@ class Settings:
         """
         for name in values.keys() - asdict(self).keys():
             raise BadInput(f"a policy has no setting {name!r}{nearest(name, asdict(self))}")
-        return replace(self, **{name: tuple(one) if isinstance(one, list) else one for name, one in values.items()})
+        return replace(
+            self, **{name: tuple(one) if isinstance(one, list) else one for name, one in values.items()}
+        )
 
 
 KINDS = {

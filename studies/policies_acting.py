@@ -28,12 +28,15 @@ def times(t: Any, numbers: Any = np) -> Any:
 class Acting:
     """A policy: :meth:`reset`, then :meth:`act` with each observation.
 
-    :param about: ``keys`` of observations, ``history``, ``kind`` (``perceptron``, ``lstm`` or ``flow``), ``chunk``.
+    :param about: ``keys`` of observations, ``history``, ``kind`` (``perceptron``, ``lstm`` or ``flow``),
+        ``chunk``.
     """
 
     def __init__(self, about: Mapping[str, Any], arrays: Arrays) -> None:
         self.about, self.arrays = about, {name: array.astype(np.float32) for name, array in arrays.items()}
-        self._layers = [name[: -len(".weight")] for name in arrays if name.startswith("layers.") and "weight" in name]
+        self._layers = [
+            name[: -len(".weight")] for name in arrays if name.startswith("layers.") and "weight" in name
+        ]
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -47,7 +50,9 @@ class Acting:
         row = np.concatenate([np.ravel(observation[key]) for key in self.about["keys"]]).astype(np.float32)
         row = (row - mean) / std
         self._seen = [*(self._seen or [row] * self.about["history"]), row][-self.about["history"] :]
-        chunk = getattr(self, f"_{self.about['kind']}")(np.concatenate(self._seen)).reshape(self.about["chunk"], -1)
+        chunk = getattr(self, f"_{self.about['kind']}")(np.concatenate(self._seen)).reshape(
+            self.about["chunk"], -1
+        )
         mean, std = self.arrays["done"]
         return np.clip(chunk * std + mean, *self.arrays["range"]).astype(np.float64).ravel()
 
@@ -59,8 +64,12 @@ class Acting:
         return features
 
     def _lstm(self, features: np.ndarray) -> np.ndarray:
-        own = {name: self.arrays[f"lstm.{name}_l0"] for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")}
-        gates = own["weight_ih"] @ features + own["bias_ih"] + own["weight_hh"] @ self._hidden + own["bias_hh"]
+        own = {
+            name: self.arrays[f"lstm.{name}_l0"] for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        }
+        gates = (
+            own["weight_ih"] @ features + own["bias_ih"] + own["weight_hh"] @ self._hidden + own["bias_hh"]
+        )
         let_in, kept, new, let_out = np.split(gates, 4)
         self._cell = _sigmoid(kept) * self._cell + _sigmoid(let_in) * np.tanh(new)
         self._hidden = _sigmoid(let_out) * np.tanh(self._cell)

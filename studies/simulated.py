@@ -29,9 +29,13 @@ class Simulated(Peers):
         how = {"count": count, "seed": seeds.start, "supervisor": supervisor}
         collect(recorded, DemonstrationsSpec(**how), path, observed=cameras)
 
-    def play(self, task: str, fitted: Fit | Policy, starts: range, folder: Path) -> Sequence[Mapping[str, float]]:
+    def play(
+        self, task: str, fitted: Fit | Policy, starts: range, folder: Path
+    ) -> Sequence[Mapping[str, float]]:
         """The outcome of an episode from each start."""
-        policy, observed = (fitted.controller(), fitted.spec.observed) if isinstance(fitted, Fit) else (fitted, ())
+        policy, observed = (
+            (fitted.controller(), fitted.spec.observed) if isinstance(fitted, Fit) else (fitted, ())
+        )
         return [episode.outcome for episode in run_episodes(task, policy, starts, 0, 1, observed, ())]
 
 

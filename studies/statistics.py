@@ -47,7 +47,9 @@ def earlier(study: Study) -> pd.DataFrame:
     for kept in study.declared.kept:
         table = read_tidy(study.path.parent / kept.table)
         of = {"seed": seeds, "study": kept.study and [kept.study], "method": [*kept.methods.values()]}
-        table = table[np.all([table[column].isin(own or table[column]) for column, own in of.items()], axis=0)]
+        table = table[
+            np.all([table[column].isin(own or table[column]) for column, own in of.items()], axis=0)
+        ]
         names = {"task": kept.tasks, "method": kept.methods, "measure": kept.measures}
         names_here = {column: {there: here for here, there in own.items()} for column, own in names.items()}
         table = table.replace(names_here).assign(study=study.path.stem)
@@ -56,7 +58,9 @@ def earlier(study: Study) -> pd.DataFrame:
     return whole.fillna(dict.fromkeys(ORIGIN, ""))
 
 
-def values(table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | int], task: str | None) -> pd.Series:
+def values(
+    table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | int], task: str | None
+) -> pd.Series:
     """The values of a method, or paired differences ``ours - theirs``, by ``task`` and ``seed``; ``counts`` of both."""
     table = table[(table.measure == measure) & (table.task.eq(task) if task is not None else True)]
 
@@ -74,7 +78,8 @@ def values(table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over tasks of means over seeds, its standard error and 95 % t interval; without spread these are NaN.
+    """A mean over tasks of means over seeds, its standard error and 95 % t interval; without spread these are
+    NaN.
 
     ``units`` are the means of the tasks or of their families, or the values of the seeds of a single one.
     """
@@ -94,18 +99,26 @@ class Estimate:
     def p_value(self, low: float, high: float = math.inf) -> float:
         """The larger p-value of two one-sided t tests, of "the mean is at most ``low``" and of "at least ``high``"."""
         freedom = len(self.units) - 1
-        below, above = t.sf((self.value - low) / self.error, freedom), t.cdf((self.value - high) / self.error, freedom)
+        below, above = (
+            t.sf((self.value - low) / self.error, freedom),
+            t.cdf((self.value - high) / self.error, freedom),
+        )
         return float(max(below, above))
 
 
 def estimate(
-    values: pd.Series, trials: int = 0, lowest: float = -1.0, families: Mapping[str, Sequence[str]] | None = None
+    values: pd.Series,
+    trials: int = 0,
+    lowest: float = -1.0,
+    families: Mapping[str, Sequence[str]] | None = None,
 ) -> Estimate:
     """The mean of values by task and seed, and its t interval.
 
-    :param trials: of each fit, where the values are rates (``lowest`` 0) or their differences (-1). Equal units have
-        Wilson's interval of all trials, a difference that of as many trials with different outcomes.
-    :param families: tasks by the name of their family, whose mean is one unit; tasks that are left out are units.
+    :param trials: of each fit, where the values are rates (``lowest`` 0) or their differences (-1). Equal
+        units have Wilson's interval of all trials, a difference that of as many trials with different
+        outcomes.
+    :param families: tasks by the name of their family, whose mean is one unit; tasks that are left out are
+        units.
     """
     of_task = {task: own.to_numpy().mean() for task, own in values.groupby(level=0, sort=False)}
     related = {task: family for family, tasks in (families or {}).items() for task in tasks}
@@ -158,9 +171,15 @@ def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
     contrasts, counts = study.declared.contrasts, study.declared.demonstrations.counts
     asked = [(one, one.demonstrations or counts[0]) for one in contrasts]
     found = [estimated(study, table, one.contrast, one.measure, [number]) for one, number in asked]
-    p_values = [own.p_value(*one.bounds) if own else math.nan for own, one in zip(found, contrasts, strict=True)]
-    places: dict[Any, int] = {(one.kind, one.contrast, one.measure, count): n for n, (one, count) in enumerate(asked)}
-    twins = {n: places.get(("superiority", *facts)) for (kind, *facts), n in places.items() if kind == EQUIVALENCE}
+    p_values = [
+        own.p_value(*one.bounds) if own else math.nan for own, one in zip(found, contrasts, strict=True)
+    ]
+    places: dict[Any, int] = {
+        (one.kind, one.contrast, one.measure, count): n for n, (one, count) in enumerate(asked)
+    }
+    twins = {
+        n: places.get(("superiority", *facts)) for (kind, *facts), n in places.items() if kind == EQUIVALENCE
+    }
     judged = verdicts(p_values, study.declared.correction, twins)
     return [Tested(*one, own, *verdict) for one, own, verdict in zip(asked, found, judged, strict=True)]
 
@@ -170,19 +189,27 @@ def verdicts(
 ) -> list[tuple[str, float]]:
     """The verdict on each claim of a family, and its adjusted p-value.
 
-    ``does not hold``: the contrary does, whose p-value is one minus that of the claim. ``inconclusive``: neither does.
-    ``not reached``: in a fixed sequence, a claim before it does not hold. ``not tested``: there is no p-value.
+    ``does not hold``: the contrary does, whose p-value is one minus that of the claim. ``inconclusive``:
+    neither does. ``not reached``: in a fixed sequence, a claim before it does not hold. ``not tested``: there
+    is no p-value.
 
-    :param twins: maps an equivalence test to the superiority test of the same contrast. In a fixed sequence it is
-        reached where its twin is, and no other claim waits for it.
+    :param twins: maps an equivalence test to the superiority test of the same contrast. In a fixed sequence
+        it is reached where its twin is, and no other claim waits for it.
     """
     given = np.array(p_values, float)
-    known, beside = np.nan_to_num(given, nan=1.0), {n: twin for n, twin in (twins or {}).items() if twin is not None}
+    known, beside = (
+        np.nan_to_num(given, nan=1.0),
+        {n: twin for n, twin in (twins or {}).items() if twin is not None},
+    )
     before, claims, contraries = np.zeros(len(known)), np.array(holm(given)), np.array(holm(1 - given))
     if correction == "fixed_sequence":
-        largest = np.maximum.accumulate([0.0, *(0.0 if place in beside else p for place, p in enumerate(known))])
+        largest = np.maximum.accumulate(
+            [0.0, *(0.0 if place in beside else p for place, p in enumerate(known))]
+        )
         before = np.array([largest[beside.get(place, place)] for place in range(len(known))])
         claims, contraries = np.maximum(before, known), np.maximum(before, 1 - known)
     named = {"not reached": before > LEVEL, NOT_TESTED: np.isnan(given), HOLDS: claims <= LEVEL,
              FAILS: contraries <= LEVEL}  # fmt: skip
-    return [*zip(np.select([*named.values()], [*named], "inconclusive").tolist(), claims.tolist(), strict=True)]
+    return [
+        *zip(np.select([*named.values()], [*named], "inconclusive").tolist(), claims.tolist(), strict=True)
+    ]

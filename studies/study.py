@@ -131,9 +131,14 @@ def main(
     own = parser.parse_args()
 
     def work() -> str:
-        settings, wanted = Settings({name: getattr(own, name) for name in defaults.values}, own.runs), [*asked(own)]
+        settings, wanted = (
+            Settings({name: getattr(own, name) for name in defaults.values}, own.runs),
+            [*asked(own)],
+        )
         if not wanted:
-            raise BadInput(f"{Path(sys.argv[0]).name}: there is nothing to do: a list or a number is empty or 0")
+            raise BadInput(
+                f"{Path(sys.argv[0]).name}: there is nothing to do: a list or a number is empty or 0"
+            )
         first(settings)
         calls = {cell.name: partial(cell.do, settings) for cell in wanted if cell.kept(settings) is None}
         with Progress() as progress:
@@ -141,7 +146,9 @@ def main(
         done = {cell: found for cell in wanted if (found := cell.kept(settings)) is not None}
         add(own.out, [row for cell, found in done.items() for row in cell.rows(found)])
         if len(done) < len(wanted):
-            raise Failed(f"{len(wanted) - len(done)} of {len(wanted)} cells failed; the same command tries them again")
+            raise Failed(
+                f"{len(wanted) - len(done)} of {len(wanted)} cells failed; the same command tries them again"
+            )
         return f"{own.out}: has the numbers of {len(done)} cells"
 
     printed(work)

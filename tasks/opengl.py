@@ -1,7 +1,8 @@
-"""Whether this machine can draw the camera's pictures: ``python3 tasks/opengl.py``, before anything is installed.
+"""Whether this machine can draw the camera's pictures: ``python3 tasks/opengl.py``, before anything is
+installed.
 
-Ends with 0, or with 1 and a line that says what is missing and how to get it. Does with the system's libraries what
-dm-control's renderers do first, through ``ctypes`` alone.
+Ends with 0, or with 1 and a line that says what is missing and how to get it. Does with the system's
+libraries what dm-control's renderers do first, through ``ctypes`` alone.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ MOST_DEVICES = 10
 
 def has_display() -> bool:
     """Whether a window system could give an OpenGL context."""
-    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return not sys.platform.startswith("linux") or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
 
 
 def missing() -> str | None:
@@ -27,7 +30,9 @@ def missing() -> str | None:
 
     Another renderer than EGL (``MUJOCO_GL``), or a window system, is taken to work.
     """
-    if os.environ.get("MUJOCO_GL", "egl").lower() != "egl" or (has_display() and "MUJOCO_GL" not in os.environ):
+    if os.environ.get("MUJOCO_GL", "egl").lower() != "egl" or (
+        has_display() and "MUJOCO_GL" not in os.environ
+    ):
         return None
     if not any(map(_loads, OPENGL)):
         return f"{OPENGL[0]} cannot be loaded"

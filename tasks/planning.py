@@ -1,7 +1,7 @@
 """Collision-free paths in joint space: RRT-Connect, then shortcuts, from the Open Motion Planning Library.
 
-A path is a function of its end points alone: the planner's random numbers start from the same seed for every path, and
-it ends by a count of iterations, not by the clock.
+A path is a function of its end points alone: the planner's random numbers start from the same seed for every
+path, and it ends by a count of iterations, not by the clock.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ def plan_path(
     is_free: Callable[[np.ndarray], bool],
     settings: Settings = DEFAULT,
 ) -> np.ndarray:
-    """The corners [K, J] of a short path from ``start`` [J] to ``goal`` [J] through joints where ``is_free`` holds.
+    """The corners [K, J] of a short path from ``start`` [J] to ``goal`` [J] through joints where ``is_free``
+    holds.
 
     :param ranges: the joints' limits [J, 2].
     :raises NoPath: when an end is not free, or the planner gives up.
@@ -79,7 +80,9 @@ def plan_path(
     iterations = itertools.count()
     setup.solve(base.PlannerTerminationCondition(lambda: next(iterations) >= ITERATIONS))
     if not setup.haveExactSolutionPath():
-        raise NoPath(f"no path from {np.round(start, 3)} to {np.round(goal, 3)} within {ITERATIONS} iterations")
+        raise NoPath(
+            f"no path from {np.round(start, 3)} to {np.round(goal, 3)} within {ITERATIONS} iterations"
+        )
     path = setup.getSolutionPath()
     _simplify(path, information, settings.shortcuts)
     return np.array([_to_array(path.getState(corner), joints) for corner in range(path.getStateCount())])
@@ -97,7 +100,8 @@ def _simplify(path: geometric.PathGeometric, information: base.SpaceInformation,
 def _restart_random_numbers() -> None:
     """Let every generator made from here on start as in a new process.
 
-    OMPL calls it an error to do this twice, since generators that exist already keep their state. None is kept here.
+    OMPL calls it an error to do this twice, since generators that exist already keep their state. None is
+    kept here.
     """
     level = util.getLogLevel()
     util.setLogLevel(util.LOG_NONE)

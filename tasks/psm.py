@@ -1,9 +1,10 @@
 """Kinematics of a da Vinci-like patient-side manipulator (PSM), and the error of its joint encoders.
 
-Six joints, in this order: yaw and pitch about the remote centre of motion (RCM), insertion of the instrument through
-it, roll about the shaft, wrist pitch and, 9.1 mm further, wrist yaw; the jaws hinge on the wrist yaw axis. Lengths are
-metres, angles radians. A gripper pose is a rotation [3, 3] and a position [3] in the world: its z axis points back
-along the gripper, its x axis is the direction in which the jaws open, so a needle is held along its y axis.
+Six joints, in this order: yaw and pitch about the remote centre of motion (RCM), insertion of the instrument
+through it, roll about the shaft, wrist pitch and, 9.1 mm further, wrist yaw; the jaws hinge on the wrist yaw
+axis. Lengths are metres, angles radians. A gripper pose is a rotation [3, 3] and a position [3] in the world:
+its z axis points back along the gripper, its x axis is the direction in which the jaws open, so a needle is
+held along its y axis.
 """
 
 from __future__ import annotations
@@ -79,8 +80,9 @@ def forward(joints: np.ndarray) -> Pose:
 def inverse(pose: Pose) -> np.ndarray:
     """The joints [6] that bring the gripper to ``pose``, in closed form.
 
-    The wrist's link is normal to the wrist yaw axis and lies in the plane of that axis and the RCM, which gives the
-    wrist pitch axis and from it the shaft; what remains of the rotation is roll, wrist pitch and wrist yaw.
+    The wrist's link is normal to the wrist yaw axis and lies in the plane of that axis and the RCM, which
+    gives the wrist pitch axis and from it the shaft; what remains of the rotation is roll, wrist pitch and
+    wrist yaw.
     """
     yaw_axis = pose.rotation[:, 1]
     wrist = pose.position + JAW_LENGTH * pose.rotation[:, 2]
@@ -92,13 +94,18 @@ def inverse(pose: Pose) -> np.ndarray:
     pitch = np.arcsin(direction[1])
     yaw = np.arctan2(-direction[0], -direction[2])
     rest = (BASE @ rotation(1, yaw) @ rotation(0, pitch)).T @ pose.rotation
-    wrist_angles = (np.arctan2(-rest[0, 1], rest[1, 1]), np.arcsin(rest[2, 1]), np.arctan2(-rest[2, 0], rest[2, 2]))
+    wrist_angles = (
+        np.arctan2(-rest[0, 1], rest[1, 1]),
+        np.arcsin(rest[2, 1]),
+        np.arctan2(-rest[2, 0], rest[2, 2]),
+    )
     return np.array([yaw, pitch, insertion, *wrist_angles])
 
 
-# Cable stretch and friction make the joints differ from what the encoders on the motors say. The difference is a fixed,
-# smooth function of the joints: small in one part of the workspace, clearly larger in the other. The constants were
-# fitted to the paper's figures after registration: 3.3 mm RMSE, 4.7 mm at the 75th percentile of the workspace.
+# Cable stretch and friction make the joints differ from what the encoders on the motors say. The difference
+# is a fixed, smooth function of the joints: small in one part of the workspace, clearly larger in the other.
+# The constants were fitted to the paper's figures after registration: 3.3 mm RMSE, 4.7 mm at the 75th
+# percentile of the workspace.
 ERROR_SMALL = 0.0008  # m
 ERROR_LARGE = 0.0060  # m
 ERROR_BORDER = 0.4
@@ -111,7 +118,9 @@ def encoder_error(joints: np.ndarray) -> np.ndarray:
     across, along = joints[0] / 0.3, joints[1] / 0.3  # -1 ... 1 over the workspace
     depth = (joints[2] - 0.15) / 0.03
     region = np.sin(1.1 * across - 1.3 * along + 0.4 * depth + 0.5)
-    size = ERROR_SMALL + (ERROR_LARGE - ERROR_SMALL) / (1.0 + np.exp(-ERROR_SHARPNESS * (region - ERROR_BORDER)))
+    size = ERROR_SMALL + (ERROR_LARGE - ERROR_SMALL) / (
+        1.0 + np.exp(-ERROR_SHARPNESS * (region - ERROR_BORDER))
+    )
     heading = 1.3 * across + 1.1 * along - 0.6
     elevation = 0.5 * np.sin(0.9 * across - 0.7 * along + 0.8)
     sideways = size * np.cos(elevation) / RCM_DISTANCE

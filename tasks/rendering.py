@@ -35,8 +35,8 @@ except _ERRORS as error:
 
 _CAMERAS: weakref.WeakKeyDictionary[mujoco.Physics, dict[tuple[str, int, int], mujoco.Camera]]
 _CAMERAS = weakref.WeakKeyDictionary()
-"""What a simulation has been seen with: to make a camera takes as long as to draw a small picture. They hold the
-simulation by a proxy, so that it goes when nobody else has it."""
+"""What a simulation has been seen with: to make a camera takes as long as to draw a small picture. They hold
+the simulation by a proxy, so that it goes when nobody else has it."""
 
 
 def render(physics: mujoco.Physics, camera: str, height: int, width: int) -> np.ndarray:

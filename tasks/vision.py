@@ -23,10 +23,10 @@ def segment(image: np.ndarray) -> np.ndarray:
 def ellipse(image: np.ndarray) -> np.ndarray | None:
     """The needle's ellipse [6], or None where too little of the needle is seen.
 
-    The centre x, y and the lengths of the major and minor axes (mm, at the height of the mat), then the cosine and sine
-    of twice the major axis' angle, which do not jump where the angle wraps. The ellipse goes through the outline of the
-    mask's convex hull: an ellipse through the pixels themselves would follow the needle's curve to a whole circle,
-    which has no principal axis.
+    The centre x, y and the lengths of the major and minor axes (mm, at the height of the mat), then the
+    cosine and sine of twice the major axis' angle, which do not jump where the angle wraps. The ellipse goes
+    through the outline of the mask's convex hull: an ellipse through the pixels themselves would follow the
+    needle's curve to a whole circle, which has no principal axis.
     """
     mask = segment(image)
     pixels = cv2.findNonZero(mask)

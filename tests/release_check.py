@@ -32,7 +32,9 @@ def check(file: Path, packages: Path | None) -> None:
         folder = Path(name)
         venv.create(folder / "venv", with_pip=True)
         binaries = folder / "venv" / "bin"
-        environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+        environment = {
+            key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")
+        }
 
         def run(*command: str | Path) -> None:
             print("$", *command, flush=True)
@@ -43,7 +45,16 @@ def check(file: Path, packages: Path | None) -> None:
             (site / "dependencies.pth").write_text(f"{packages.resolve()}\n")
             run("pip", "install", "-q", "--no-deps", file.resolve())
         else:
-            run("pip", "install", "-q", "--find-links", TORCH_CPU, "-c", ROOT / "constraints.txt", file.resolve())
+            run(
+                "pip",
+                "install",
+                "-q",
+                "--find-links",
+                TORCH_CPU,
+                "-c",
+                ROOT / "constraints.txt",
+                file.resolve(),
+            )
         run("python", "-c", INSTALLED)
         run("ddco-pyro", "--version")
         run("ddco-pyro", "new", "mine.hdf5", "--out", "new", "--no-open")
@@ -55,7 +66,9 @@ def check(file: Path, packages: Path | None) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", type=Path, nargs="+")
-    parser.add_argument("--packages", type=Path, help="a folder with the dependencies, instead of installing them")
+    parser.add_argument(
+        "--packages", type=Path, help="a folder with the dependencies, instead of installing them"
+    )
     given = parser.parse_args()
     for one in given.files:
         check(one, given.packages)

@@ -41,9 +41,9 @@ def fitted(hierarchy: Hierarchy) -> Hierarchy:
 class Controller:
     """A policy from a fitted hierarchy: call :meth:`reset`, then :meth:`act` with each observation.
 
-    At each step active options may terminate, new options are selected, and the lowest option emits the control.
-    After a step ``choices`` holds the active option of each level, 1 to k_d or 0 for control by the caller, and
-    ``terminations`` their ψ in the last state (1 for choice 0), lowest level first.
+    At each step active options may terminate, new options are selected, and the lowest option emits the
+    control. After a step ``choices`` holds the active option of each level, 1 to k_d or 0 for control by the
+    caller, and ``terminations`` their ψ in the last state (1 for choice 0), lowest level first.
 
     >>> controller = ddco_pyro.Controller(fit.hierarchy, options="most_likely")  # or fit.controller()
     >>> controller.reset(seed=0)
@@ -52,8 +52,9 @@ class Controller:
 
     :param hierarchy: such as ``fit.hierarchy``.
     :param control: execute the ``mean`` control or a ``sample``.
-    :param options: ``sample`` terminations and selections; take the ``most_likely`` of each; or take the choices with
-        the largest ``marginal`` p(h_t | s_0, ..., s_t), which accumulates the probability that options have ended.
+    :param options: ``sample`` terminations and selections; take the ``most_likely`` of each; or take the
+        choices with the largest ``marginal`` p(h_t | s_0, ..., s_t), which accumulates the probability that
+        options have ended.
     :param seed: of the first episode.
     :param names: the names of the choices of each level, lowest first, such as ``fit.names``.
     :raises BadInput: one of these is something else.
@@ -68,7 +69,10 @@ class Controller:
         names: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> None:
         self.hierarchy, self.names = fitted(hierarchy), names
-        for name, given, known in (("control", control, ControlExecution), ("options", options, OptionExecution)):
+        for name, given, known in (
+            ("control", control, ControlExecution),
+            ("options", options, OptionExecution),
+        ):
             if given not in get_args(known):
                 raise BadInput(f"{name}={given!r}: has to be one of {', '.join(get_args(known))}")
         self.control, self.options = control, options
@@ -104,7 +108,8 @@ class Controller:
             (now,) = complete(outputs.tables(), torch.tensor([1])).steps()
             chosen = self._chosen(now, generator)
             acting = Acting(
-                tuple(None if emission is None else emission.steps()[0] for emission in outputs.emissions), chosen
+                tuple(None if emission is None else emission.steps()[0] for emission in outputs.emissions),
+                chosen,
             )
             if self.control == "mean":
                 control = acting.mode
@@ -124,7 +129,9 @@ class Controller:
             self._log_marginal = arrive(self._log_marginal, now)
             sizes = self._log_marginal.shape[1:]  # C_D, ..., C_1
             return (
-                tuple(reversed(torch.unravel_index(self._log_marginal.flatten(1).argmax(-1), sizes))) if sizes else ()
+                tuple(reversed(torch.unravel_index(self._log_marginal.flatten(1).argmax(-1), sizes)))
+                if sizes
+                else ()
             )
         before = tuple(torch.tensor([choice]) for choice in self.choices)
         with Chosen(None if self.options == "most_likely" else generator):
@@ -151,7 +158,7 @@ class Chosen(Messenger):
         message["done"] = True
 
 
-# --- observations that arrive one at a time ---------------------------------------------------------------------------
+# --- observations that arrive one at a time -----------------------------------------------------------------
 
 
 class Window:

@@ -21,7 +21,8 @@ from ddco_pyro.names import choice_names
 
 
 class Monitor:
-    """An online filter of another agent's options: call :meth:`step` with each observation and the previous control.
+    """An online filter of another agent's options: call :meth:`step` with each observation and the previous
+    control.
 
     >>> monitor = fit.monitor()
     >>> demo = demos[0]
@@ -31,14 +32,17 @@ class Monitor:
     >>> active["option"]["control"], round(sum(active["option"].values()), 6)  # and a number for each option
     (0.0, 1.0)
 
-    :param names: the names of the choices of each level, lowest first, such as ``fit.names``; by default numbers.
+    :param names: the names of the choices of each level, lowest first, such as ``fit.names``; by default
+        numbers.
     :ivar belief: the exact belief after :meth:`step`, of each level [1, 1 + k], lowest first.
     :raises BadInput: ``hierarchy`` is something else.
     """
 
     belief: tuple[Tensor, ...]
 
-    def __init__(self, hierarchy: Hierarchy, names: Mapping[str, Sequence[str]] = MappingProxyType({})) -> None:
+    def __init__(
+        self, hierarchy: Hierarchy, names: Mapping[str, Sequence[str]] = MappingProxyType({})
+    ) -> None:
         self.hierarchy = fitted(hierarchy)
         counts = enumerate(level.count for level in self.hierarchy.option_levels())
         self.names = names or {f"level-{1 + number}": choice_names(count) for number, count in counts}
@@ -47,7 +51,9 @@ class Monitor:
     def reset(self) -> None:
         """Begin an episode."""
         self._window, self._filter = Window(self.hierarchy.encoder), Filter(float(self.hierarchy.power))
-        self._alone = self._filter if self.hierarchy.recogniser is None else Filter(float(self.hierarchy.power))
+        self._alone = (
+            self._filter if self.hierarchy.recogniser is None else Filter(float(self.hierarchy.power))
+        )
         self._seen: list[Tensor] = []
         self._outputs: Outputs | None = None
         self._states: States | None = None
@@ -82,17 +88,23 @@ class Monitor:
                 tables = tables.with_evidence(recogniser.level, self._evidence(recogniser, inputs, scaled))
                 self.belief = self._filter.predict(complete(tables, ONE_STEP).steps()[0])
         levels = zip(self.names.items(), self.belief, strict=True)
-        return {level: dict(zip(names, choices[0].tolist(), strict=True)) for (level, names), choices in levels}
+        return {
+            level: dict(zip(names, choices[0].tolist(), strict=True)) for (level, names), choices in levels
+        }
 
     def _evidence(self, recogniser: Recogniser, inputs: Inputs, before: Tensor | None) -> Tensor:
         """What the past says of each choice, [1, 1, 1 + k].
 
         :param before: the scaled control before this step, [1, 1, A'].
         """
-        before = inputs.vector.new_zeros(1, 1, len(self.hierarchy.scaling.varying)) if before is None else before
+        before = (
+            inputs.vector.new_zeros(1, 1, len(self.hierarchy.scaling.varying)) if before is None else before
+        )
         now = torch.cat([observed(inputs), before.double()], dim=-1)[0, 0]
         self._seen = [*self._seen, now][-1 - int(recogniser.past.widths.max()) :]
-        return (recogniser.gamma * recogniser.past.log_ratio(recogniser.past.latest(self._seen))).reshape(1, 1, -1)
+        return (recogniser.gamma * recogniser.past.log_ratio(recogniser.past.latest(self._seen))).reshape(
+            1, 1, -1
+        )
 
     def _scaled(self, control: np.ndarray | None) -> Tensor:
         scaling = self.hierarchy.scaling

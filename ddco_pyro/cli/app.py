@@ -1,7 +1,7 @@
 """The command line ``ddco-pyro``.
 
-The exit status is 0 (done), 1 (failed) or 2 (bad input). An error is one line: the problem, its place and the remedy;
-``--debug`` shows the traceback. Commands import what they need when they are called.
+The exit status is 0 (done), 1 (failed) or 2 (bad input). An error is one line: the problem, its place and the
+remedy; ``--debug`` shows the traceback. Commands import what they need when they are called.
 """
 
 from __future__ import annotations

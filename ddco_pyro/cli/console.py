@@ -86,7 +86,9 @@ class Progress:
                 name, _, further = model.partition(" ")
                 self._begin(f"training {method(name)} {further}".rstrip(), epochs)
             case EpochEnded():
-                self._advance(note=f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step")
+                self._advance(
+                    note=f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step"
+                )
             case RestartStopped(restart, epochs):
                 self._say(f"restart {restart}: stopped at epoch {epochs} (far behind the likeliest)")
             case RestartDiverged(restart, why):
@@ -109,7 +111,9 @@ class Progress:
         self._rich.add_task(label, total=total, note="")
         self._task, self._last = self._rich.tasks[-1], time.monotonic()
 
-    def _advance(self, label: str = "", total: int | None = None, done: int | None = None, note: str = "") -> None:
+    def _advance(
+        self, label: str = "", total: int | None = None, done: int | None = None, note: str = ""
+    ) -> None:
         """Count one more, or ``done`` in all; begin with this label and total where no count is open."""
         if self._task is None or (label and self._task.finished):
             self._begin(label, total)
@@ -148,10 +152,12 @@ def show(table: Table) -> None:
     Console(width=None if Console().is_terminal else WIDE).print(table.console())
 
 
-# --- check ------------------------------------------------------------------------------------------------------------
+# --- check --------------------------------------------------------------------------------------------------
 
 
-def model(spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]) -> None:
+def model(
+    spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]
+) -> None:
     """Shapes, the parameters of each network and baseline, the kinds of the control, and a device that is no CPU."""
     from ddco_pyro.training.networks import parameters
     from ddco_pyro.training.processes import described as device_in_words
@@ -192,14 +198,16 @@ def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) 
     if used is not None and own is not None:
         names = (label_name(own.source, value, known.get(own.source, ()), own.level) for value in used.values)
         each = ", ".join(f"{name} is {option_name(option)}" for option, name in enumerate(names, start=1))
-        say(f"labels/{own.source}, level {own.level!r}: {each}; used of {len(used.demonstrations)} demonstrations")
+        say(
+            f"labels/{own.source}, level {own.level!r}: {each}; used of {len(used.demonstrations)} demonstrations"
+        )
         from ddco_pyro.evaluation.options import unlabelled_start
 
         for what, advice in unlabelled_start(spec.training):
             say(f"warning: {what} {advice}")
 
 
-# --- fit, select, rollout ---------------------------------------------------------------------------------------------
+# --- fit, select, rollout -----------------------------------------------------------------------------------
 
 
 def skills(fit: Fit) -> None:
@@ -287,7 +295,9 @@ def names(fit: Fit) -> None:
             say(f"names proposed, not written: {words.listed(said)}; to take them, write into {file}: {line}")
     if found:
         labels = words.listed(dict.fromkeys(f"labels/{one.labels}" for one in found.values()))
-        say(f"Agreement with {labels}: the steps with both an option and its label, divided by the steps with either.")
+        say(
+            f"Agreement with {labels}: the steps with both an option and its label, divided by the steps with either."
+        )
 
 
 def successes(metrics: Metrics) -> None:
@@ -299,12 +309,10 @@ def successes(metrics: Metrics) -> None:
     say(verdicts.success(metrics))
 
 
-# --- inspect ----------------------------------------------------------------------------------------------------------
+# --- inspect ------------------------------------------------------------------------------------------------
 
 
-UNKNOWN_FREQUENCY = (
-    'not in the file; with h5py, file.attrs["control_frequency"] = 20 says 20 steps per second, and pages have seconds'
-)
+UNKNOWN_FREQUENCY = 'not in the file; with h5py, file.attrs["control_frequency"] = 20 says 20 steps per second, and pages have seconds'
 
 
 def inspection(facts: Inspection) -> None:
@@ -321,12 +329,18 @@ def inspection(facts: Inspection) -> None:
     if facts.several:
         _tasks(facts)
     elif facts.tasks:
-        say(printable(f"tasks: {few([*facts.tasks])}" if len(facts.tasks) < 4 else f"tasks: {len(facts.tasks)}"))
+        say(
+            printable(
+                f"tasks: {few([*facts.tasks])}" if len(facts.tasks) < 4 else f"tasks: {len(facts.tasks)}"
+            )
+        )
     rows = [
         [field.place, str(list(field.shape)), str(field.dtype), _range(field), _notes(field)]
         for field in facts.fields.values()
     ]
-    show(Table(["", "a step", "type", "range", "notes"], [list(map(printable, row)) for row in rows], range(5)))
+    show(
+        Table(["", "a step", "type", "range", "notes"], [list(map(printable, row)) for row in rows], range(5))
+    )
     for line in (*facts.notes, *(f"problem: {problem}" for problem in facts.problems)):
         say(printable(line))
 
@@ -352,12 +366,20 @@ def annotators(found: Mapping[str, Annotators], tolerance: int) -> None:
         middle = float(np.median(own.distances)) if own.distances else None
         same = own.same / own.both if own.both else None
         said = [words.percent(own.both / own.steps), words.percent(same), words.number(own.kappa)]
-        matched = [" and ".join(map(str, own.boundaries)), words.number(own.boundary_f1), words.number(middle, 1)]
+        matched = [
+            " and ".join(map(str, own.boundaries)),
+            words.number(own.boundary_f1),
+            words.number(middle, 1),
+        ]
         rows.append([name, str(own.demonstrations), str(own.steps), *said, *matched])
     show(Table([*head, f"F1 ±{tolerance}", "median distance"], rows))
     for name, own in found.items():
         rows = [
-            [called, str(sum(counts)), *(words.percent(count / sum(counts)) if count else "" for count in counts)]
+            [
+                called,
+                str(sum(counts)),
+                *(words.percent(count / sum(counts)) if count else "" for count in counts),
+            ]
             for called, counts in zip(own.names, own.counts, strict=True)
             if any(counts)
         ]
@@ -383,7 +405,9 @@ def _notes(field: Field) -> str:
         notes.append("constant up to rounding" if rounding else "constant")
     elif constant + rounding and not field.image:
         listed = {"constant": constant, "constant up to rounding": rounding}
-        notes += [f"{what}: {', '.join(map(str, dimensions))}" for what, dimensions in listed.items() if dimensions]
+        notes += [
+            f"{what}: {', '.join(map(str, dimensions))}" for what, dimensions in listed.items() if dimensions
+        ]
     elif field.still and not field.video:
         notes.append("one value per demonstration")
     return "; ".join(notes)

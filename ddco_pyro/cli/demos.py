@@ -24,16 +24,22 @@ if TYPE_CHECKING:
     from ddco_pyro.data.tasks import Where
 
 SourcePath = Annotated[
-    Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}.")
+    Path,
+    typer.Argument(
+        metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}."
+    ),
 ]
 FormatOption = Annotated[
-    str | None, typer.Option("--format", metavar="NAME", help=f"One of {', '.join(FORMATS)}; recognised unless given.")
+    str | None,
+    typer.Option("--format", metavar="NAME", help=f"One of {', '.join(FORMATS)}; recognised unless given."),
 ]
 
 
 def collect(
     spec: SpecPath,
-    out: Annotated[Path | None, written("file", "The HDF5 file; by default in the cache, by content.")] = None,
+    out: Annotated[
+        Path | None, written("file", "The HDF5 file; by default in the cache, by content.")
+    ] = None,
     overrides: Overrides = [],  # noqa: B006
     allow_code: AllowCode = False,
 ) -> None:
@@ -54,10 +60,13 @@ def inspect(
     form: FormatOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all of it as JSON.")] = False,
     against: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Compare labels with those of another annotator instead.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Compare labels with those of another annotator instead."),
     ] = None,
     wheres: Wheres = [],  # noqa: B006
-    tolerance: Annotated[int, typer.Option(min=0, help="Steps between boundaries that match, for --against.")] = 5,
+    tolerance: Annotated[
+        int, typer.Option(min=0, help="Steps between boundaries that match, for --against.")
+    ] = 5,
 ) -> None:
     """Print the contents of a file: keys, shapes, lengths, ranges, NaN, constant dimensions, masks, a starting spec."""
     if against is not None:
@@ -86,7 +95,9 @@ def inspect(
         print(f"\nto fit to it, import it first: {command('import', file, '--out', 'demos.hdf5')}")
         return
     try:
-        print(f"\n{starting_spec(facts, file).text}\nnext: {command('init', file, '--out', f'{file.stem}.yaml')}")
+        print(
+            f"\n{starting_spec(facts, file).text}\nnext: {command('init', file, '--out', f'{file.stem}.yaml')}"
+        )
     except DemonstrationsError as error:
         print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
 
@@ -175,7 +186,8 @@ def _decided(spec: Spec, facts: Inspection, segment: str | None, segments: int |
 
 def import_(
     sources: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Demonstrations, as inspect takes them; several are pooled.")
+        list[Path],
+        typer.Argument(metavar="FILE...", help="Demonstrations, as inspect takes them; several are pooled."),
     ],
     out: Annotated[Path, written("file", "The HDF5 file to write.")],
     form: FormatOption = None,
@@ -190,13 +202,20 @@ def import_(
             help="The control, where a dataset has several; repeatable, joined in this order.",
         ),
     ] = [],  # noqa: B006
-    mask: Annotated[str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")] = None,
-    wheres: Wheres = [],  # noqa: B006
-    videos: Annotated[bool, typer.Option("--videos", help="Decode the videos of a LeRobot dataset too.")] = False,
-    image_size: Annotated[
-        int | None, typer.Option(min=8, max=4096, help="Scale pictures to so many pixels in height and width.")
+    mask: Annotated[
+        str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")
     ] = None,
-    hz: Annotated[float | None, typer.Option(min=0.01, help="Steps a second: means over the source's frames.")] = None,
+    wheres: Wheres = [],  # noqa: B006
+    videos: Annotated[
+        bool, typer.Option("--videos", help="Decode the videos of a LeRobot dataset too.")
+    ] = False,
+    image_size: Annotated[
+        int | None,
+        typer.Option(min=8, max=4096, help="Scale pictures to so many pixels in height and width."),
+    ] = None,
+    hz: Annotated[
+        float | None, typer.Option(min=0.01, help="Steps a second: means over the source's frames.")
+    ] = None,
     labels: Annotated[
         Path | None,
         typer.Option(
@@ -207,30 +226,36 @@ def import_(
     ] = None,
     columns: Annotated[
         str | None,
-        typer.Option(metavar="ROLE=NAME,...", help="The columns of TABLE: demonstration=A,label=B,start=C,stop=D."),
+        typer.Option(
+            metavar="ROLE=NAME,...", help="The columns of TABLE: demonstration=A,label=B,start=C,stop=D."
+        ),
     ] = None,
     unit: Annotated[
         Literal["seconds", "milliseconds", "steps"] | None,
         typer.Option(help="The unit of TABLE's times, unless its columns say it."),
     ] = None,
     fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Steps per second, for --labels; by default what FILE says.")
+        float | None,
+        typer.Option(min=0.001, help="Steps per second, for --labels; by default what FILE says."),
     ] = None,
     skip_broken: Annotated[
-        bool, typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them.")
+        bool,
+        typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them."),
     ] = False,
 ) -> None:
     """Write demonstrations of another format, or of several files, into this project's layout.
 
-    Of several files, each is a task unless the demonstrations name theirs. What only some have is left out, and said.
-    With --labels, FILE may have this layout already.
+    Of several files, each is a task unless the demonstrations name theirs. What only some have is left out,
+    and said. With --labels, FILE may have this layout already.
     """
     from ddco_pyro.cli import console
     from ddco_pyro.data.annotations import LabelTable
     from ddco_pyro.data.importing import Choice, import_demonstrations
 
     if labels is None and (fps or columns or unit):
-        raise BadInput("--fps, --columns and --unit are about the table of --labels; give it, or --hz for another rate")
+        raise BadInput(
+            "--fps, --columns and --unit are about the table of --labels; give it, or --hz for another rate"
+        )
     size = (image_size, image_size) if image_size else None
     table = LabelTable(labels, _columns(columns), unit, fps) if labels else None
     where = where_of(wheres)
@@ -249,9 +274,13 @@ def _columns(text: str | None) -> dict[str, str]:
     """The columns that ``demonstration=A,label=B,start=C,stop=D``, or a part of it, names."""
     from ddco_pyro.data.annotations import ROLES
 
-    columns = {role: name for role, _, name in (part.partition("=") for part in text.split(","))} if text else {}
+    columns = (
+        {role: name for role, _, name in (part.partition("=") for part in text.split(","))} if text else {}
+    )
     if columns.keys() - set(ROLES) or "" in columns.values():
-        raise BadInput(f"--columns {text}: write {','.join(f'{role}=COLUMN' for role in ROLES)}, or a part of it")
+        raise BadInput(
+            f"--columns {text}: write {','.join(f'{role}=COLUMN' for role in ROLES)}, or a part of it"
+        )
     return columns
 
 
@@ -259,11 +288,15 @@ def encode(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.")],
     observation: Annotated[str, typer.Option(metavar="KEY", help="The pictures to encode.")],
     encoder: Annotated[
-        str, typer.Option(metavar="NAME", help="timm:NAME, such as timm:resnet18.a1_in1k, or your own module:function.")
+        str,
+        typer.Option(
+            metavar="NAME", help="timm:NAME, such as timm:resnet18.a1_in1k, or your own module:function."
+        ),
     ],
     out: Annotated[Path, written("file", "The HDF5 file to write.")],
     size: Annotated[
-        int | None, typer.Option(min=1, help="Principal components to keep; 64 unless there are fewer features.")
+        int | None,
+        typer.Option(min=1, help="Principal components to keep; 64 unless there are fewer features."),
     ] = None,
     name: Annotated[
         str | None, typer.Option("--as", metavar="NAME", help="The new observation; KEY_features by default.")

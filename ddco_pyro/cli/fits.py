@@ -64,7 +64,8 @@ def fit(
     library: Annotated[
         Path | None,
         typer.Option(
-            metavar="RUN", help="A run of other tasks, at whose options this one begins; SPEC then says what differs."
+            metavar="RUN",
+            help="A run of other tasks, at whose options this one begins; SPEC then says what differs.",
         ),
     ] = None,
     wheres: Wheres = [],  # noqa: B006
@@ -76,11 +77,14 @@ def fit(
         ),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation.")
+        int | None,
+        typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation."),
     ] = None,
     log: Annotated[
         list[str],
-        typer.Option("--log", metavar="NAME", help="Log training, too: tensorboard or wandb-offline; repeatable."),
+        typer.Option(
+            "--log", metavar="NAME", help="Log training, too: tensorboard or wandb-offline; repeatable."
+        ),
     ] = [],  # noqa: B006
     resume: Annotated[
         bool, typer.Option("--resume", help="Where --out holds this run, finished, show it again.")
@@ -89,13 +93,13 @@ def fit(
 ) -> None:
     """Fit the spec's options and its baselines; write the run folder with its report.
 
-    An unfinished run of the same spec in --out is continued, with any number of processes. Under torchrun processes
-    share each gradient step, at most training.shards of them.
+    An unfinished run of the same spec in --out is continued, with any number of processes. Under torchrun
+    processes share each gradient step, at most training.shards of them.
 
     With --library one demonstration is enough: all that there are train, from the options of another run.
 
-    With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other first
-    weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.
+    With --seeds the fit and its baselines are repeated, in --jobs processes, with other training seeds: other
+    first weights, clusters and orders of the same demonstrations. RUN/seeds has a run for each.
     """
     from ddco_pyro.training.processes import together
 
@@ -143,7 +147,9 @@ def fit_and_report(
     repeated = () if seeds is None else ("--seeds", str(seeds))
     more = [word for name in logs for word in ("--log", name)]
     logged = [Log(name, folder, loaded.model_dump(mode="json"), console.say) for name in logs]
-    again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *more, *_allowed(loaded))
+    again = command(
+        "fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *more, *_allowed(loaded)
+    )
     with _continued(again, folder), console.Progress() as progress, ExitStack() as stack:
         for log in logged:
             stack.enter_context(log)
@@ -181,9 +187,13 @@ def select(
     spec: SpecPath,
     out: Annotated[Path | None, written("folder", "The folder; by default runs/SPEC-select-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
-    folds: Annotated[int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")] = None,
+    folds: Annotated[
+        int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")
+    ] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data."""

@@ -28,17 +28,21 @@ def label(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="The copy of DEMOS that gets the labels; by default DEMOS_labels, here."),
+        typer.Option(
+            metavar="PATH", help="The copy of DEMOS that gets the labels; by default DEMOS_labels, here."
+        ),
     ] = None,
     in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into DEMOS itself.")] = False,
     skills: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="Names of skills, such as reach,grasp,place, or a file of them.")
+        str | None,
+        typer.Option(metavar="NAMES", help="Names of skills, such as reach,grasp,place, or a file of them."),
     ] = None,
     annotator: Annotated[
         str, typer.Option(metavar="NAME", help="Who labels; each annotator has labels and a journal apart.")
     ] = "",
     team: Annotated[
-        str, typer.Option(metavar="NAMES", help="Annotators who share the demonstrations out, such as ann,bob.")
+        str,
+        typer.Option(metavar="NAMES", help="Annotators who share the demonstrations out, such as ann,bob."),
     ] = "",
     twice: Annotated[
         float, typer.Option(min=0, max=1, help="The share of demonstrations that two annotators label.")
@@ -50,13 +54,15 @@ def label(
     level: Level = None,
     wheres: Wheres = [],  # noqa: B006
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 is any that is free.")] = 0,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
+    ] = True,
     allow_code: AllowCode = False,
 ) -> None:
     """Correct segments on a page of this machine; what you say is used for all other demonstrations at once.
 
-    Labels of each level go into labels/LEVEL, or into a LeRobot dataset's language columns. Ctrl-C saves them. The same
-    command goes on with them.
+    Labels of each level go into labels/LEVEL, or into a LeRobot dataset's language columns. Ctrl-C saves
+    them. The same command goes on with them.
     """
     if len(paths) > 2:
         raise BadInput("label: name a run and a file of demonstrations, or the file alone")
@@ -114,7 +120,8 @@ def _names(skills: str | None) -> list[str]:
 
 
 def _fitted(file: Path, count: int = 0, where: Mapping[str, Sequence[str]] = {}) -> Path:
-    """A run fitted to the file, without baselines, left-out demonstrations and report; a finished one is used again.
+    """A run fitted to the file, without baselines, left-out demonstrations and report; a finished one is used
+    again.
 
     Of a dataset of another library, the numbers are imported for it.
 

@@ -37,7 +37,9 @@ def compare(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN RUN...", help="Run folders; a run's baselines are runs, too.")
     ],
-    out: Annotated[Path | None, written("folder", "The folder to write to; by default runs/compare-TIME.")] = None,
+    out: Annotated[
+        Path | None, written("folder", "The folder to write to; by default runs/compare-TIME.")
+    ] = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
@@ -55,7 +57,9 @@ def compare(
 
 def rollout(
     run: RunPath,
-    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")
+    ] = None,
     best: Best = False,
     video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
     jobs: Jobs = -1,
@@ -66,8 +70,8 @@ def rollout(
 ) -> None:
     """Roll the model, its baselines and the spec's scripted policies out from the same initial states.
 
-    The repetitions of fit --seeds are rolled out, too. With --best one model alone is rolled out, beside the scripted
-    policies.
+    The repetitions of fit --seeds are rolled out, too. With --best one model alone is rolled out, beside the
+    scripted policies.
     """
     from ddco_pyro.cli import console
     from ddco_pyro.fitting.fitted import load
@@ -105,7 +109,7 @@ def _check_run(run: Path, *names: str) -> None:
     check_outputs([*files, Output("RUN", run / "figures", "folder")])
 
 
-# --- segment and export -----------------------------------------------------------------------------------------------
+# --- segment and export -------------------------------------------------------------------------------------
 
 
 def _to(option: str) -> Any:
@@ -117,7 +121,8 @@ def _to(option: str) -> Any:
 def segment(
     run: RunPath,
     demos: Annotated[
-        Path, typer.Argument(metavar="DEMOS", help="Demonstrations: an HDF5 file, or a Minari or LeRobot dataset.")
+        Path,
+        typer.Argument(metavar="DEMOS", help="Demonstrations: an HDF5 file, or a Minari or LeRobot dataset."),
     ],
     html: Annotated[Path | None, _to("--html")] = None,
     csv: Annotated[Path | None, _to("--csv")] = None,
@@ -130,7 +135,9 @@ def segment(
     label_studio: Annotated[Path | None, _to("--label-studio")] = None,
     elan: Annotated[Path | None, _to("--elan")] = None,
     rerun: Annotated[Path | None, _to("--rerun")] = None,
-    in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")
+    ] = False,
     same_order: Annotated[
         bool,
         typer.Option(
@@ -138,7 +145,9 @@ def segment(
             help="Leave demonstrations out of --mimicgen and --isaac if their options follow another order than most.",
         ),
     ] = False,
-    level: Annotated[str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.")] = None,
+    level: Annotated[
+        str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.")
+    ] = None,
     wheres: Wheres = [],  # noqa: B006
     fps: Annotated[
         float | None,
@@ -151,7 +160,9 @@ def segment(
     DEMOS is changed with --in-place only.
     """
     given = locals()
-    named = {option: given[option[2:].replace("-", "_")] for option in FORMATS} | {"--in-place": in_place and demos}
+    named = {option: given[option[2:].replace("-", "_")] for option in FORMATS} | {
+        "--in-place": in_place and demos
+    }
     places = {option: path for option, path in named.items() if path}
     if not places:
         raise BadInput(

@@ -17,7 +17,10 @@ from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.spec import load_spec
 
 Show = Annotated[
-    bool, typer.Option("--open/--no-open", help="Show the page in a browser, where there is a terminal and a display.")
+    bool,
+    typer.Option(
+        "--open/--no-open", help="Show the page in a browser, where there is a terminal and a display."
+    ),
 ]
 
 
@@ -28,8 +31,8 @@ def new(
 ) -> None:
     """From a file to segments on a page: inspect, init, fit and segment.
 
-    The folder has spec.yaml, to be changed as you like, the run folder run, and segments.html. Called again with the
-    same folder, the command continues.
+    The folder has spec.yaml, to be changed as you like, the run folder run, and segments.html. Called again
+    with the same folder, the command continues.
     """
     folder = out or Path("runs") / file.stem
     spec, run, page = folder / "spec.yaml", folder / "run", folder / "segments.html"
@@ -69,7 +72,8 @@ TASK = "needle"
 def demo(
     out: Annotated[Path, written("folder", "The folder to write to.")] = Path("runs/demo"), show: Show = True
 ) -> None:
-    """Fit a small example: the simulated needle task, or generated pick-and-place where it cannot be simulated.
+    """Fit a small example: the simulated needle task, or generated pick-and-place where it cannot be
+    simulated.
 
     Called again, an unfinished demo is continued.
     """

@@ -37,7 +37,8 @@ PICTURES = np.dtype(np.uint8)
 
 @dataclass(frozen=True)
 class LazyArray:
-    """An array [T, ...] that is read when it is asked for: a slice of its steps, or all of it by ``np.asarray``.
+    """An array [T, ...] that is read when it is asked for: a slice of its steps, or all of it by
+    ``np.asarray``.
 
     :param read: gives the steps from ``start`` to before ``stop`` in blocks.
     :param where: name in errors, such as ``demo_0: obs/camera``.
@@ -73,7 +74,9 @@ class LazyArray:
         return whole[::stride]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        refuse_too_much(self.dtype.itemsize * math.prod(self.shape), self.where or "an array", "divide the episode")
+        refuse_too_much(
+            self.dtype.itemsize * math.prod(self.shape), self.where or "an array", "divide the episode"
+        )
         return self[:].astype(dtype or self.dtype, copy=False)
 
 
@@ -108,7 +111,9 @@ def same(left: Observed, right: Observed) -> bool:
         return False
     at_once = block_steps(left.shape[1:], left.dtype)
     firsts = range(0, len(left), at_once)
-    return all(np.array_equal(left[first : first + at_once], right[first : first + at_once]) for first in firsts)
+    return all(
+        np.array_equal(left[first : first + at_once], right[first : first + at_once]) for first in firsts
+    )
 
 
 def usable(values: np.ndarray) -> np.ndarray:
@@ -118,7 +123,7 @@ def usable(values: np.ndarray) -> np.ndarray:
     return np.abs(values) <= min(LARGEST, float(np.finfo(values.dtype).max))  # false for NaN
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
+# --- pictures -----------------------------------------------------------------------------------------------
 
 
 def is_picture(array: Observed) -> bool:
@@ -134,8 +139,8 @@ def in_file(array: Observed) -> bool:
 def channels_last(shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
     """The shape [T, H, W, C] of pictures stored as [T, C, H, W] or [T, H, W]; any other shape unchanged.
 
-    Arrays of unsigned 8 or 16 bits are pictures if both sides are longer than 4 pixels and channels, if any, number 1,
-    3 or 4. Pictures without a channel axis are grey.
+    Arrays of unsigned 8 or 16 bits are pictures if both sides are longer than 4 pixels and channels, if any,
+    number 1, 3 or 4. Pictures without a channel axis are grey.
     """
     sides, most = shape[-2:], max(CHANNELS)
     if dtype not in (np.uint8, np.uint16) or min(sides, default=0) <= most:
@@ -152,16 +157,21 @@ def turned(array: np.ndarray) -> np.ndarray:
     shape = channels_last(array.shape, array.dtype)
     if shape == array.shape:
         return array
-    return array[..., None] if array.ndim == PICTURE_DIMENSIONS else np.ascontiguousarray(np.moveaxis(array, 1, -1))
+    return (
+        array[..., None]
+        if array.ndim == PICTURE_DIMENSIONS
+        else np.ascontiguousarray(np.moveaxis(array, 1, -1))
+    )
 
 
-# --- what networks read -----------------------------------------------------------------------------------------------
+# --- what networks read -------------------------------------------------------------------------------------
 
 
 def network_input(
     shape: tuple[int, ...], dtype: np.dtype[Any] = PICTURES
 ) -> tuple[Literal["vector", "picture", ""], str]:
-    """What networks read of an observation whose steps have this shape and type, else why they read nothing of it.
+    """What networks read of an observation whose steps have this shape and type, else why they read nothing
+    of it.
 
     Real numbers of at most two dimensions are a vector, flattened. A picture is uint8 [H, W, C].
 
@@ -193,7 +203,7 @@ def no_numbers(dtype: np.dtype[Any]) -> str:
     return f"holds {'text' if text else 'text or other objects' if dtype.kind == 'O' else dtype}, not numbers"
 
 
-# --- memory: no number of a result depends on it ----------------------------------------------------------------------
+# --- memory: no number of a result depends on it ------------------------------------------------------------
 
 PROGRAM = 680e6
 """Bytes of a fit to next to nothing: mostly torch, Pyro and compiled code."""
@@ -212,9 +222,14 @@ def free(root: Path = Path("/")) -> float:
     """
     found = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
     try:
-        available = re.search(r"^MemAvailable:\s+(\d+) kB$", (root / "proc/meminfo").read_text(), re.MULTILINE)
+        available = re.search(
+            r"^MemAvailable:\s+(\d+) kB$", (root / "proc/meminfo").read_text(), re.MULTILINE
+        )
         found += [float(available[1]) * 1024] if available else []
-        group, top = (root / "proc/self/cgroup").read_text().strip().rpartition("::")[2], root / "sys/fs/cgroup"
+        group, top = (
+            (root / "proc/self/cgroup").read_text().strip().rpartition("::")[2],
+            root / "sys/fs/cgroup",
+        )
         own = top / group.strip("/")
         limits = [part / "memory.max" for part in (own, *own.parents) if part.is_relative_to(top)]
         found += [float(file.read_text()) for file in limits if file.exists() and file.read_text() != "max\n"]
@@ -231,4 +246,6 @@ def refuse_too_much(needed: float, what: str, remedy: str) -> None:
     """
     if needed >= SMALL and needed > (there := free()):
         size = math.ceil(needed / 1e8) / 10
-        raise DemonstrationsError(f"{what} takes about {size:g} GB of memory, and {there / 1e9:.4g} are free; {remedy}")
+        raise DemonstrationsError(
+            f"{what} takes about {size:g} GB of memory, and {there / 1e9:.4g} are free; {remedy}"
+        )

@@ -13,7 +13,7 @@ from ddco_pyro.data.controls import listed
 from ddco_pyro.data.demonstrations import split_by_masks
 from ddco_pyro.data.errors import DemonstrationsError
 
-# --- copies -----------------------------------------------------------------------------------------------------------
+# --- copies -------------------------------------------------------------------------------------------------
 
 
 def copies(digests: Mapping[str, bytes], masks: Mapping[str, Sequence[str]]) -> Iterator[str]:
@@ -38,14 +38,14 @@ def copies(digests: Mapping[str, bytes], masks: Mapping[str, Sequence[str]]) -> 
         yield f"{those}, the first {again}, which equals {first}: {effect}"
 
 
-# --- what is no observation -------------------------------------------------------------------------------------------
+# --- what is no observation ---------------------------------------------------------------------------------
 
 LOOKED_AT = 1000
 """Steps of each demonstration in which observations are compared with controls."""
 
 SHIFTS = {0: ("at the same step", 1e-3), 1: ("of the next step", 1e-3), -1: ("of the step before", 1e-6)}
-"""Steps by which a control follows the observation that tells it, and the largest share of the observation's variance,
-1 - R², that the control leaves unexplained."""
+"""Steps by which a control follows the observation that tells it, and the largest share of the observation's
+variance, 1 - R², that the control leaves unexplained."""
 
 FEWEST = 10
 """Fewest pairs of steps that tell anything."""
@@ -54,8 +54,8 @@ EXACT = 1e-9
 """What is unexplained by rounding alone."""
 
 LATER = 0.1
-"""An observation that follows the control of the step before is a state that the control moved. A copy of a later
-control leaves less than this part of what that one leaves."""
+"""An observation that follows the control of the step before is a state that the control moved. A copy of a
+later control leaves less than this part of what that one leaves."""
 
 CLOCKS = {"timestamp", "timestamps", "time", "clock"}
 """Keys of observations that are clocks where they rise, however unevenly."""
@@ -126,9 +126,11 @@ class Beside:
 
     @property
     def followed(self) -> bool:
-        """Whether the control is a target of the observation: near to it at this or the next step, number by number.
+        """Whether the control is a target of the observation: near to it at this or the next step, number by
+        number.
 
-        The observation has as many numbers, and their difference at the same step varies where the control does.
+        The observation has as many numbers, and their difference at the same step varies where the control
+        does.
         """
         (seen, controls), (now, then) = self.at(0), self.at(-1)
         if seen.shape[1] != controls.shape[1] or len(now) < FEWEST:
@@ -163,7 +165,9 @@ class Beside:
         found = {shift: each for shift, each in self.told.items() if shift >= 0}
         if not rest or not rest <= {number for observed, _ in found.values() for number in observed}:
             return ""
-        controls = " and ".join(f"control {listed(told)} {SHIFTS[shift][0]}" for shift, (_, told) in found.items())
+        controls = " and ".join(
+            f"control {listed(told)} {SHIFTS[shift][0]}" for shift, (_, told) in found.items()
+        )
         return f"is {controls}, up to units and noise, which a policy has to predict"
 
     def notes(self) -> Iterator[str]:
@@ -179,7 +183,7 @@ def generated(place: str) -> str:
     return next((why for part, why in GENERATED.items() if part in place.split("/")), "")
 
 
-# --- angles and quaternions -------------------------------------------------------------------------------------------
+# --- angles and quaternions ---------------------------------------------------------------------------------
 
 TURNS = {"2π": 2 * math.pi, "360": 360.0}
 """A turn in radians and in degrees, and what it is called."""
@@ -208,14 +212,20 @@ class Jumps:
         """A line for the angles of an array that jump by a turn, and for its quaternions that change their sign."""
         where, seen = f"the first in {self.first}", place != "actions"
         for unit, numbers in self.angles.items():
-            remedy = f"with angles: {numbers} beside its key networks read sine and cosine" if seen else "unwrap it"
+            remedy = (
+                f"with angles: {numbers} beside its key networks read sine and cosine"
+                if seen
+                else "unwrap it"
+            )
             if seen and unit != "2π":
                 remedy = f"store radians; {remedy}"
             if numbers:
                 jump = f"jump{'s' * (len(numbers) == 1)} by {unit} as an angle"
                 yield f"{place}: {listed(numbers)} {jump}, {where}: {remedy}"
         if numbers := self.quaternions:
-            remedy = f"with quaternions: {numbers} beside its key networks read products, the same for q and −q"
+            remedy = (
+                f"with quaternions: {numbers} beside its key networks read products, the same for q and −q"
+            )
             yield (
                 f"{place}: {listed([first + part for first in numbers for part in range(4)])} change sign as a "
                 f"quaternion, {where}: {remedy if seen else 'give all rotations one sign'}"
@@ -225,8 +235,8 @@ class Jumps:
 def jumps(each: Mapping[str, np.ndarray]) -> Jumps | None:
     """The jumps of an array [T, D] of demonstrations by name; None without any.
 
-    An angle lies within a turn, and jumps by a turn but not by a part of one. A quaternion may begin with another sign
-    than in the first demonstration.
+    An angle lies within a turn, and jumps by a turn but not by a part of one. A quaternion may begin with
+    another sign than in the first demonstration.
     """
     rows = np.concatenate([*each.values()]).astype(np.float64)
     starts = np.cumsum([0, *map(len, each.values())])[:-1]
@@ -240,7 +250,9 @@ def jumps(each: Mapping[str, np.ndarray]) -> Jumps | None:
         quaternions: list[int] = []
         for place in np.flatnonzero(flips.any(0)).tolist():
             quaternions += [place] if not quaternions or place >= quaternions[-1] + 4 else []
-        free = ~np.isin(np.arange(rows.shape[1]), [first + part for first in quaternions for part in range(4)])
+        free = ~np.isin(
+            np.arange(rows.shape[1]), [first + part for first in quaternions for part in range(4)]
+        )
         angles, jumped = {}, flips.any(1)
         for unit, turn in TURNS.items():
             by_turn = changes > NEARLY * turn

@@ -45,22 +45,23 @@ def same(values: np.ndarray, value: np.ndarray | float) -> np.ndarray:
 
 
 RESOLUTION = 1e-9
-"""A dimension is treated as constant if its range is below RESOLUTION × its largest magnitude, or for coarser types
-:data:`LAST_PLACES` units in the last place."""
+"""A dimension is treated as constant if its range is below RESOLUTION × its largest magnitude, or for coarser
+types :data:`LAST_PLACES` units in the last place."""
 
 LAST_PLACES = 4
 
 SETTLED = 256 * float(np.finfo(np.float32).eps)
-"""A dimension is treated as constant if its range is below SETTLED (3e-5) × the observation's largest magnitude, at
-most 1. Simulators round all components of a vector alike in every step: components of a quaternion at rest vary by 6e-7
-to 1.6e-5 in Meta-World's files. The bound of 1 is for mixed units, where one dimension may be in the thousands."""
+"""A dimension is treated as constant if its range is below SETTLED (3e-5) × the observation's largest
+magnitude, at most 1. Simulators round all components of a vector alike in every step: components of a
+quaternion at rest vary by 6e-7 to 1.6e-5 in Meta-World's files. The bound of 1 is for mixed units, where one
+dimension may be in the thousands."""
 
 
 def rounding(low: np.ndarray, high: np.ndarray, dtype: np.dtype[Any]) -> np.ndarray:
     """The largest range of each dimension that counts as rounding, [D]; wider dimensions vary.
 
-    :param low: the smallest value of each dimension of an observation [D]; ``high`` the largest. Values that are not
-        finite give NaN.
+    :param low: the smallest value of each dimension of an observation [D]; ``high`` the largest. Values that
+        are not finite give NaN.
     :param dtype: the type of the values in the file; whole numbers are not rounded.
     """
     sizes = np.maximum(np.abs(np.asarray(low, np.float64)), np.abs(np.asarray(high, np.float64)))
@@ -78,16 +79,18 @@ class ControlDimension:
 
     :param number: index of the dimension, from 0.
     :param minimum: the smallest value, in the control's units; ``maximum`` likewise.
-    :param at_minimum: number of steps at the minimum within rounding (:data:`ROUNDING`); ``at_maximum`` likewise.
+    :param at_minimum: number of steps at the minimum within rounding (:data:`ROUNDING`); ``at_maximum``
+        likewise.
     :param steps: number of steps with finite values.
     :param distinct: the sorted values if there are at most :data:`MOST_DISTINCT`; else empty.
     :param inside: the commonest value strictly between the extremes; None without a common value.
     :param at_inside: number of steps that equal ``inside``.
     :param together: other dimensions that equal their ``inside`` in the same steps (:data:`TOGETHER`).
     :param integer: whether the controls have an integer type.
-    :param made_by: for ``minimum``, ``maximum`` and ``inside``: names of the few demonstrations (:data:`FEW`) without
-        which the value would be rare. Such a value decides no kind.
-    :param exceptions: names of the few demonstrations without which the dimension would be constant or a switch.
+    :param made_by: for ``minimum``, ``maximum`` and ``inside``: names of the few demonstrations (:data:`FEW`)
+        without which the value would be rare. Such a value decides no kind.
+    :param exceptions: names of the few demonstrations without which the dimension would be constant or a
+        switch.
     """
 
     number: int
@@ -123,14 +126,19 @@ class ControlDimension:
 
     @property
     def extremes(self) -> tuple[tuple[str, float, float], ...]:
-        """(``minimum`` or ``maximum``, its value, share of the steps that equal it) for extremes that are common.
+        """(``minimum`` or ``maximum``, its value, share of the steps that equal it) for extremes that are
+        common.
 
-        Empty for discrete dimensions and for one or two values. An extreme that occurs once does not count, nor one
-        that few demonstrations make.
+        Empty for discrete dimensions and for one or two values. An extreme that occurs once does not count,
+        nor one that few demonstrations make.
         """
         ends = (("minimum", self.minimum, self.at_minimum), ("maximum", self.maximum, self.at_maximum))
-        often = [(name, value, at / self.steps) for name, value, at in ends if at > max(1, OFTEN * self.steps)]
-        return () if self.values or self.discrete else tuple(end for end in often if end[0] not in self.made_by)
+        often = [
+            (name, value, at / self.steps) for name, value, at in ends if at > max(1, OFTEN * self.steps)
+        ]
+        return (
+            () if self.values or self.discrete else tuple(end for end in often if end[0] not in self.made_by)
+        )
 
     @property
     def atom(self) -> str:
@@ -147,7 +155,9 @@ class ControlDimension:
             return ""
         each = ((getattr(self, end), names) for end, names in self.made_by.items())
         common = [f"{number(value)} is common in {few(names)} alone" for value, names in each]
-        return "; ".join([*common, *([f"a switch without {few(self.exceptions)}"] if self.exceptions else [])])
+        return "; ".join(
+            [*common, *([f"a switch without {few(self.exceptions)}"] if self.exceptions else [])]
+        )
 
     @property
     def note(self) -> str:
@@ -157,7 +167,8 @@ class ControlDimension:
         if self.values:
             return f"takes two values, {number(self.minimum)} and {number(self.maximum)}"
         ends = ", at its ".join(
-            f"{name} {number(value)} in {100 * share:.1f} % of the steps" for name, value, share in self.extremes
+            f"{name} {number(value)} in {100 * share:.1f} % of the steps"
+            for name, value, share in self.extremes
         )
         return "; ".join(filter(None, (self.atom, ends and f"exactly at its {ends}", self.made)))
 
@@ -172,7 +183,8 @@ def few(names: Sequence[str]) -> str:
 
 
 class _Steps:
-    """The values of one dimension over all steps [T]; ``starts`` [N] are the first steps of demonstrations by name.
+    """The values of one dimension over all steps [T]; ``starts`` [N] are the first steps of demonstrations by
+    name.
 
     ``low``, ``high``, ``at_low``, ``at_high`` and ``steps`` are the statistics of each demonstration, [N].
     """
@@ -213,7 +225,10 @@ class _Steps:
         values, times = np.unique(np.concatenate([self.low[two], self.high[two]]), return_counts=True)
         commonest = values[np.argsort(-times, kind="stable")]
         for count in (1, 2):
-            ends = [np.any([same(end, value) for value in commonest[:count]], axis=0) for end in (self.low, self.high)]
+            ends = [
+                np.any([same(end, value) for value in commonest[:count]], axis=0)
+                for end in (self.low, self.high)
+            ]
             outside = np.flatnonzero(~(two & np.all(ends, 0)) & (self.steps > 0))
             if len(commonest) >= count and len(outside) <= most_few(len(self.steps)):
                 return tuple(self.names[place] for place in outside.tolist())
@@ -223,8 +238,12 @@ class _Steps:
         """The commonest value between the extremes; one that few demonstrations make comes last."""
         often = self.times >= max(FEWEST, ATOM * len(self.values))
         ends = np.array([self.low.min(), self.high.max()])
-        values = [value for value in (self.distinct[often] + 0.0).tolist() if not same(ends, value).any()]  # no minus 0
-        key = {value: (bool(self.made_by(value, ATOM, FEWEST)), -int(self.at(value).sum())) for value in values}
+        values = [
+            value for value in (self.distinct[often] + 0.0).tolist() if not same(ends, value).any()
+        ]  # no minus 0
+        key = {
+            value: (bool(self.made_by(value, ATOM, FEWEST)), -int(self.at(value).sum())) for value in values
+        }
         return min(values, key=key.__getitem__, default=None)
 
 
@@ -238,7 +257,9 @@ def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimen
         return ()
     integer = all(steps.dtype.kind in "iu" for steps in controls.values())
     starts = np.cumsum([0, *(len(controls[name]) for name in names)])
-    rows = np.concatenate([controls[name].reshape(len(controls[name]), -1) for name in names]).astype(np.float64)
+    rows = np.concatenate([controls[name].reshape(len(controls[name]), -1) for name in names]).astype(
+        np.float64
+    )
     dimensions: dict[int, ControlDimension] = {}
     rests: dict[int, np.ndarray] = {}
     for index, values in enumerate(rows.T):
@@ -281,16 +302,22 @@ def most_few(number: int) -> int:
 
 def all_constant(dimensions: Sequence[ControlDimension]) -> str:
     """The problem with controls that never vary, in words."""
-    values = ", ".join(number(dimension.minimum) for dimension in dimensions[:5]) + ", ..." * (len(dimensions) > 5)
+    values = ", ".join(number(dimension.minimum) for dimension in dimensions[:5]) + ", ..." * (
+        len(dimensions) > 5
+    )
     return f"actions: every dimension is constant ({values}) in all demonstrations, so there is no control to model"
 
 
 def notes(dimensions: Iterable[ControlDimension]) -> list[str]:
     """A line for each unusual dimension."""
-    return [f"control dimension {dimension.number}: {dimension.note}" for dimension in dimensions if dimension.note]
+    return [
+        f"control dimension {dimension.number}: {dimension.note}"
+        for dimension in dimensions
+        if dimension.note
+    ]
 
 
-# --- kinds of distribution --------------------------------------------------------------------------------------------
+# --- kinds of distribution ----------------------------------------------------------------------------------
 
 KINDS = tuple(kind for kind in get_args(Kind) if kind != "auto")
 BOUNDED = ("clipped", "hurdle")
@@ -304,8 +331,8 @@ class ControlPart:
 
     :param dims: indices of the control dimensions; constant dimensions belong to no part.
     :param kind: one of :data:`KINDS`.
-    :param low: for each dimension, in the control's units: the lower bound (-inf for none) of a ``clipped`` or
-        ``hurdle`` part, the lower value of a ``binary`` part; ``high`` likewise. Empty for other kinds.
+    :param low: for each dimension, in the control's units: the lower bound (-inf for none) of a ``clipped``
+        or ``hurdle`` part, the lower value of a ``binary`` part; ``high`` likewise. Empty for other kinds.
     :param values: the actions of a one-dimensional ``categorical`` part.
     :param exact: the value of each ``hurdle`` dimension that has a probability; empty for other kinds.
     :param why: the reason for the kind, in words.
@@ -342,7 +369,9 @@ class ControlPart:
 
 def described(parts: Sequence[ControlPart]) -> list[str]:
     """A line for each part: dimensions, kind, and reason."""
-    return [f"control {listed(part.dims)}: {part.kind}" + (f" ({part.why})" if part.why else "") for part in parts]
+    return [
+        f"control {listed(part.dims)}: {part.kind}" + (f" ({part.why})" if part.why else "") for part in parts
+    ]
 
 
 def listed(dims: Sequence[int]) -> str:
@@ -358,10 +387,11 @@ def listed(dims: Sequence[int]) -> str:
 
 
 def measure(parts: Sequence[ControlPart]) -> dict[str, list[Any]]:
-    """The reference measure of a log-likelihood by dimension. Log-likelihoods compare only under equal measures.
+    """The reference measure of a log-likelihood by dimension. Log-likelihoods compare only under equal
+    measures.
 
-    Each entry is the kind, followed by the bounds of a ``clipped`` dimension (None for no bound) or the values of a
-    discrete dimension. For ``hurdle``: bounds, exact value, and the dimensions of the part.
+    Each entry is the kind, followed by the bounds of a ``clipped`` dimension (None for no bound) or the
+    values of a discrete dimension. For ``hurdle``: bounds, exact value, and the dimensions of the part.
     """
     dimensions: dict[str, list[Any]] = {}
     for part in parts:
@@ -425,7 +455,9 @@ def refuse_unknown_dimensions(spec: ControlSpec, size: int) -> None:
             )
 
 
-def _parts(declared: str, dimensions: Sequence[ControlDimension], place: str, name: str) -> Iterator[ControlPart]:
+def _parts(
+    declared: str, dimensions: Sequence[ControlDimension], place: str, name: str
+) -> Iterator[ControlPart]:
     """One part for each kind among the dimensions.
 
     :param place: key path of the spec, for errors.
@@ -438,7 +470,11 @@ def _parts(declared: str, dimensions: Sequence[ControlDimension], place: str, na
         called = kind if not name else name if len(kinds) == 1 else f"{name} {kind}"
         groups = [[dim] for dim in alike] if kind == "categorical" else [alike]
         for own in _resting_together(alike, place) if kind == "hurdle" else groups:
-            bounds = [_ends(dim, kind, place, len(alike) == 1) for dim in own] if kind in (*BOUNDED, *DISCRETE) else []
+            bounds = (
+                [_ends(dim, kind, place, len(alike) == 1) for dim in own]
+                if kind in (*BOUNDED, *DISCRETE)
+                else []
+            )
             yield ControlPart(
                 called if kind != "categorical" or len(groups) == 1 else f"{called} {own[0].number}",
                 tuple(dim.number for dim in own),
@@ -460,7 +496,11 @@ def _kind(dim: ControlDimension, declared: str, alone: bool) -> tuple[str, str]:
         return declared, f"{len(dim.distinct)} discrete actions"
     if declared != "auto":
         unbounded = dim.atom and declared not in ("hurdle", *DISCRETE)
-        warning = f"; {dim.atom}, and options gain by collecting these steps, without any skill" if unbounded else ""
+        warning = (
+            f"; {dim.atom}, and options gain by collecting these steps, without any skill"
+            if unbounded
+            else ""
+        )
         return declared, f"as declared{warning}"
     kind, why = "gaussian", "varies freely"
     if dim.values:
@@ -495,11 +535,17 @@ def _resting_together(dimensions: Sequence[ControlDimension], place: str) -> lis
 def _ends(dim: ControlDimension, kind: str, place: str, alone: bool) -> tuple[float, float]:
     """The bounds of a dimension, or its extreme values where it is discrete."""
     if kind == "categorical" and not dim.distinct:
-        raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values")
+        raise SpecError(
+            f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values"
+        )
     if kind == "categorical" and not alone and not all(value.is_integer() for value in dim.distinct):
-        raise SpecError(f"{place}.kind: control dimension {dim.number} is not of whole numbers: no discrete action")
+        raise SpecError(
+            f"{place}.kind: control dimension {dim.number} is not of whole numbers: no discrete action"
+        )
     if kind == "binary" and len(dim.values) != 2:
-        raise SpecError(f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch")
+        raise SpecError(
+            f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch"
+        )
     if kind in DISCRETE:
         return dim.minimum, dim.maximum
     often = {name: value for name, value, _ in dim.extremes}

@@ -43,13 +43,14 @@ class Demonstration:
     >>> len(demo), demo.actions.dtype, demo.labels["phase"].shape
     (10, dtype('float64'), (10,))
 
-    :param observations: key to [T, ...]; uint8 stays, other numbers become float64. Pictures uint8 [T, C, H, W] or
-        [T, H, W] become [T, H, W, C]. Pictures in files are a lazy :class:`~ddco_pyro.data.arrays.LazyArray`.
+    :param observations: key to [T, ...]; uint8 stays, other numbers become float64. Pictures uint8 [T, C, H,
+        W] or [T, H, W] become [T, H, W, C]. Pictures in files are a lazy
+        :class:`~ddco_pyro.data.arrays.LazyArray`.
     :param actions: the controls [T, A], float64; whole numbers [T] or [T, A] become int64.
     :param labels: ground-truth segments by name, [T] or [T, 1], int64.
     :param attributes: facts about the demonstration, such as its seed.
-    :raises DemonstrationsError: no steps, unequal lengths, other values than numbers, or numbers that are NaN, infinite
-        or beyond :data:`ddco_pyro.data.arrays.LARGEST`.
+    :raises DemonstrationsError: no steps, unequal lengths, other values than numbers, or numbers that are
+        NaN, infinite or beyond :data:`ddco_pyro.data.arrays.LARGEST`.
     """
 
     name: str
@@ -65,7 +66,9 @@ class Demonstration:
             )
         for what, arrays in (("observations", self.observations), ("labels", self.labels)):
             if not isinstance(arrays, Mapping) or not all(isinstance(key, str) for key in arrays):
-                raise DemonstrationsError(f"{self.name}: {what} have to be a mapping of names to arrays [T, ...]")
+                raise DemonstrationsError(
+                    f"{self.name}: {what} have to be a mapping of names to arrays [T, ...]"
+                )
         given = Demonstration.stored(**vars(self))
         check(given)
         vars(self).update(
@@ -84,10 +87,11 @@ class Demonstration:
         labels: Mapping[str, Any] = NOTHING,
         attributes: Mapping[str, Attribute] = NOTHING,
     ) -> Demonstration:
-        """A demonstration as its source stores it: of any types, observations lazy or not, and not yet checked.
+        """A demonstration as its source stores it: of any types, observations lazy or not, and not yet
+        checked.
 
-        Pictures get their channels last, whole numbers as controls [T] become [T, 1], and labels [T, 1] become [T].
-        ``Demonstration(**vars(stored))`` is the same, checked and ready for a fit.
+        Pictures get their channels last, whole numbers as controls [T] become [T, 1], and labels [T, 1]
+        become [T]. ``Demonstration(**vars(stored))`` is the same, checked and ready for a fit.
 
         :raises DemonstrationsError: something is no array.
         """
@@ -96,7 +100,9 @@ class Demonstration:
             try:
                 return values if isinstance(values, LazyArray) else turned(np.asarray(values))
             except (ValueError, TypeError, RuntimeError) as error:
-                raise DemonstrationsError(f"{name}: {place} is no array: {' '.join(str(error).split())}") from None
+                raise DemonstrationsError(
+                    f"{name}: {place} is no array: {' '.join(str(error).split())}"
+                ) from None
 
         demo, control = object.__new__(cls), array("actions", actions)
         known = {key: array(f"labels/{key}", values) for key, values in labels.items()}
@@ -104,7 +110,9 @@ class Demonstration:
             name=name,
             observations={key: array(f"obs/{key}", values) for key, values in observations.items()},
             actions=control[:, None] if control.dtype.kind in "iu" and control.ndim == 1 else control,
-            labels={key: values[:, 0] if values.shape[1:] == (1,) else values for key, values in known.items()},
+            labels={
+                key: values[:, 0] if values.shape[1:] == (1,) else values for key, values in known.items()
+            },
             attributes=attributes,
         )
         return demo
@@ -112,7 +120,11 @@ class Demonstration:
     def arrays(self) -> dict[str, Observed]:
         """Every array by its place: ``actions``, ``obs/<key>``, ``labels/<name>``."""
         seen = {f"obs/{key}": array for key, array in self.observations.items()}
-        return {"actions": self.actions, **seen, **{f"labels/{key}": array for key, array in self.labels.items()}}
+        return {
+            "actions": self.actions,
+            **seen,
+            **{f"labels/{key}": array for key, array in self.labels.items()},
+        }
 
     def controls(self, relative_to: str | None = None) -> np.ndarray:
         """The controls [T, A]; minus the observation of this key, where there is one.
@@ -138,7 +150,9 @@ class Demonstration:
     @property
     def shapes(self) -> str:
         """The arrays, a line each."""
-        return "".join(f"\n  {place} {[*array.shape[1:]]} {array.dtype}" for place, array in self.arrays().items())
+        return "".join(
+            f"\n  {place} {[*array.shape[1:]]} {array.dtype}" for place, array in self.arrays().items()
+        )
 
 
 def _ready(array: Observed) -> Observed:
@@ -149,14 +163,14 @@ def _ready(array: Observed) -> Observed:
     return values if values.dtype == np.uint8 else values.astype(np.float64)
 
 
-# --- checks -----------------------------------------------------------------------------------------------------------
+# --- checks -------------------------------------------------------------------------------------------------
 
 
 def check(demo: Demonstration, first: Demonstration | None = None) -> None:
     """Refuse a demonstration that cannot be used, or not together with the first one; no lazy value is read.
 
-    It has no steps, an array of something else than numbers or of other steps than the controls; or its arrays, or
-    their shapes at one step, are not those of the first demonstration.
+    It has no steps, an array of something else than numbers or of other steps than the controls; or its
+    arrays, or their shapes at one step, are not those of the first demonstration.
 
     :raises DemonstrationsError: it is such a demonstration.
     """
@@ -191,12 +205,16 @@ def problem_of(place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
     if place.startswith("labels/"):
         had = "text" if dtype.kind in "OSU" else str(dtype)
         stored = f"is {had} of shape [{', '.join(map(str, ('steps', *shape)))}]"
-        return "" if dtype.kind in "iub" and not shape else f"{stored}, it has to be integers of shape [steps]"
+        return (
+            "" if dtype.kind in "iub" and not shape else f"{stored}, it has to be integers of shape [steps]"
+        )
     if dtype.kind not in NUMBERS:
         return no_numbers(dtype)
     if shape:
         return (
-            "" if len(shape) == 1 and shape[0] else f"has shape {list(shape)} at each step, it has to be [dimensions]"
+            ""
+            if len(shape) == 1 and shape[0]
+            else f"has shape {list(shape)} at each step, it has to be [dimensions]"
         )
     return (
         f"is {dtype} of shape [steps]; store discrete actions as integers (astype(int)), and anything else as "
@@ -259,7 +277,7 @@ def check_fitted(demo: Demonstration, shapes: Mapping[str, tuple[int, ...]], con
             raise DemonstrationsError(f"{demo.name}: {place} {why}")
 
 
-# --- numbers ----------------------------------------------------------------------------------------------------------
+# --- numbers ------------------------------------------------------------------------------------------------
 
 
 def number(value: float) -> str:
@@ -277,7 +295,8 @@ COPIES = 4.0 + 16.0
 
 
 def needed(demos: Iterable[Demonstration], copies: float = COPIES) -> float:
-    """Bytes for demonstrations, by the shapes of their arrays: the arrays as read, and copies padded to the longest.
+    """Bytes for demonstrations, by the shapes of their arrays: the arrays as read, and copies padded to the
+    longest.
 
     Pictures that stay in their file count for nothing.
 

@@ -51,8 +51,8 @@ class Demonstrations(Sequence[Demonstration]):
 
     :param masks: name to names of demonstrations, such as ``{"valid": ("demo_3", "demo_7")}``.
     :param attributes: facts about all of them.
-    :raises DemonstrationsError: there are none, a name occurs twice, their arrays differ, or a mask names an unknown
-        demonstration.
+    :raises DemonstrationsError: there are none, a name occurs twice, their arrays differ, or a mask names an
+        unknown demonstration.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -88,7 +88,8 @@ class Demonstrations(Sequence[Demonstration]):
         :param labels: names of the ground-truth labels to read; likewise.
         :param exclude: names of demonstrations that are not read and are removed from masks.
         :param where: attributes and values, such as ``{"task": ["reach"]}``: others are not read either.
-        :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into memory.
+        :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into
+            memory.
         """
         whole = path_of(path, "demonstrations")
         with open_own(whole, where, exclude) as source:
@@ -168,14 +169,18 @@ class Demonstrations(Sequence[Demonstration]):
     def split(self, valid_fraction: float, seed: int) -> tuple[Demonstrations, Demonstrations]:
         """Training and validation demonstrations, at least one each.
 
-        The split follows the masks ``train`` and ``valid``; one mask leaves the rest to the other. Without these masks,
-        ``valid_fraction`` of the demonstrations of each task are drawn with ``seed`` for validation.
+        The split follows the masks ``train`` and ``valid``; one mask leaves the rest to the other. Without
+        these masks, ``valid_fraction`` of the demonstrations of each task are drawn with ``seed`` for
+        validation.
 
-        :raises DemonstrationsError: one part is empty, the masks overlap, or the fraction is not from 0 to below 1.
+        :raises DemonstrationsError: one part is empty, the masks overlap, or the fraction is not from 0 to
+            below 1.
         """
         check_whole("seed", seed)
         if not isinstance(valid_fraction, Real) or not 0 <= valid_fraction < 1:
-            raise DemonstrationsError(f"valid_fraction={valid_fraction!r}: has to be a number from 0 to below 1")
+            raise DemonstrationsError(
+                f"valid_fraction={valid_fraction!r}: has to be a number from 0 to below 1"
+            )
         masks = self.masks
         if not masks.keys() & {"train", "valid"}:
             masks = {"valid": drawn({demo.name: demo.attributes for demo in self}, valid_fraction, seed)}
@@ -192,7 +197,9 @@ def with_tasks(demos: Demonstrations, tasks: Sequence[str] = ()) -> Demonstratio
     for name, task in zip(demos.names, demos.tasks, strict=True):
         if not (task or tasks):
             wanted = " or ".join(NAMES)
-            raise DemonstrationsError(f"observations: task: {name} names none; give it the attribute {wanted}")
+            raise DemonstrationsError(
+                f"observations: task: {name} names none; give it the attribute {wanted}"
+            )
     tasks = tasks or sorted({*demos.tasks}, key=natural)
     each = tuple(with_task(demo, tasks) for demo in demos)
     return replace(demos, demonstrations=each, attributes={**demos.attributes, TASKS: json.dumps(tasks)})
@@ -204,8 +211,12 @@ def with_labels_of_tasks(demos: Demonstrations) -> Demonstrations:
     each, names = of_tasks(demos.tasks, [demo.labels for demo in demos], known)
     if names == known:
         return demos
-    parts = tuple(Demonstration.stored(**{**vars(demo), "labels": own}) for demo, own in zip(demos, each, strict=True))
-    return replace(demos, demonstrations=parts, attributes={**demos.attributes, LABEL_NAMES: json.dumps(names)})
+    parts = tuple(
+        Demonstration.stored(**{**vars(demo), "labels": own}) for demo, own in zip(demos, each, strict=True)
+    )
+    return replace(
+        demos, demonstrations=parts, attributes={**demos.attributes, LABEL_NAMES: json.dumps(names)}
+    )
 
 
 def not_demonstrations(given: object) -> DemonstrationsError:
@@ -216,10 +227,12 @@ def not_demonstrations(given: object) -> DemonstrationsError:
     )
 
 
-# --- division ---------------------------------------------------------------------------------------------------------
+# --- division -----------------------------------------------------------------------------------------------
 
 
-def split_by_masks(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def split_by_masks(
+    names: Sequence[str], masks: Mapping[str, Sequence[str]]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Training and validation demonstrations by the masks ``train`` and ``valid``.
 
     If one of the masks is missing, it has all other demonstrations.
@@ -231,14 +244,19 @@ def split_by_masks(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> 
     valid = given.get("valid", tuple(name for name in names if name not in train))
     for purpose, members in (("train", train), ("validate", valid)):
         if not members:
-            raise DemonstrationsError(f"no demonstration is left to {purpose} with; add some or change the masks")
+            raise DemonstrationsError(
+                f"no demonstration is left to {purpose} with; add some or change the masks"
+            )
     if both := {*train} & {*valid}:
-        raise DemonstrationsError(f"{min(both, key=natural)} is in mask/train and in mask/valid; remove it from one")
+        raise DemonstrationsError(
+            f"{min(both, key=natural)} is in mask/train and in mask/valid; remove it from one"
+        )
     return train, valid
 
 
 def with_values(attribute: str, known: Known, fraction: float, seed: int) -> dict[str, tuple[str, ...]]:
-    """Demonstrations to hold out by some values of an attribute, about a fraction of all: their names by value.
+    """Demonstrations to hold out by some values of an attribute, about a fraction of all: their names by
+    value.
 
     :param known: the attributes of each demonstration by its name.
     :param seed: draws the order in which values are tried.
@@ -247,7 +265,9 @@ def with_values(attribute: str, known: Known, fraction: float, seed: int) -> dic
     members = {value: tuple(names) for value, names in by_value(attribute, known).items()}
     if len(members) == 1:
         (value,) = members
-        raise DemonstrationsError(f"attribute {attribute!r} is {value} in all demonstrations; hold out by another one")
+        raise DemonstrationsError(
+            f"attribute {attribute!r} is {value} in all demonstrations; hold out by another one"
+        )
     values, wanted = sorted(members, key=natural), fraction * len(known)
     chosen, number = dict[str, tuple[str, ...]](), 0
     for place in np.random.default_rng(seed).permutation(len(values)):
@@ -276,7 +296,8 @@ def drawn(known: Known, fraction: float, seed: int) -> tuple[str, ...]:
 def check_division(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> None:
     """Refuse demonstrations that are too few for a fit, by the masks or for a random split.
 
-    :raises DemonstrationsError: they are too few, a mask names an unknown demonstration, or the masks overlap.
+    :raises DemonstrationsError: they are too few, a mask names an unknown demonstration, or the masks
+        overlap.
     """
     for problem in problems_of_masks(masks, names):
         raise DemonstrationsError(problem)

@@ -68,8 +68,8 @@ class Output:
 def check_outputs(outputs: Sequence[Output], inputs: Sequence[Path] = ()) -> None:
     """Refuse outputs that cannot be written, before a command starts to work. Nothing is changed.
 
-    :param inputs: files and folders that the command reads; no output may be or lie in one of them, or in what links in
-        them lead to.
+    :param inputs: files and folders that the command reads; no output may be or lie in one of them, or in
+        what links in them lead to.
     :raises BadInput: an output has an impossible name, is of another kind, cannot be written, is an input, or
         coincides with another output.
     :raises Failed: the disk is full.
@@ -226,10 +226,14 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in _FULL:
-            raise Failed(f"{path}: there is no room to write it; free some space, then do the same again") from error
+            raise Failed(
+                f"{path}: there is no room to write it; free some space, then do the same again"
+            ) from error
         if error.errno in _FORBIDDEN:
             text = os.strerror(error.errno)
-            raise BadInput(f"{path}: cannot be written: {text}; choose another place or change this one") from error
+            raise BadInput(
+                f"{path}: cannot be written: {text}; choose another place or change this one"
+            ) from error
         raise
 
 
@@ -251,7 +255,9 @@ def only_one(folder: Path, wait: bool = False) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             os.close(handle)
-            raise Busy(f"{folder}: another process is at work on it; wait for it, or choose another place") from None
+            raise Busy(
+                f"{folder}: another process is at work on it; wait for it, or choose another place"
+            ) from None
         if folder.exists() and os.path.samestat(os.fstat(handle), folder.stat()):
             break
         os.close(handle)  # the last holder has removed the folder

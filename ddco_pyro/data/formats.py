@@ -11,11 +11,12 @@ class Format(NamedTuple):
     """A format of demonstrations.
 
     :param reader: yields one open :class:`~ddco_pyro.data.sources.Source`, ``module:function`` in
-        :mod:`ddco_pyro.data.sources`. A module imports its own library, which need not be installed for other formats.
+        :mod:`ddco_pyro.data.sources`. A module imports its own library, which need not be installed for other
+        formats.
     :param text: the path in words, such as ``the folder of a Minari dataset``.
     :param sign: a file or folder that tells a folder of this format.
-    :param fits: whether a path has the format, if the sign alone does not tell; also given the names at the top of an
-        HDF5 file, else none.
+    :param fits: whether a path has the format, if the sign alone does not tell; also given the names at the
+        top of an HDF5 file, else none.
     :param parts: whether the control may have parts, whose names are the reader's argument ``actions``.
     """
 
@@ -44,14 +45,22 @@ def _folder(path: Path, names: Collection[str], files: str = "*") -> bool:
 
 
 FORMATS = {
-    "lerobot": Format("lerobot:open_lerobot", "the folder of a LeRobot dataset", "meta/info.json", parts=True),
-    "minari": Format("minari:open_minari", "the folder of a Minari dataset", "data/metadata.json", _minari, parts=True),
+    "lerobot": Format(
+        "lerobot:open_lerobot", "the folder of a LeRobot dataset", "meta/info.json", parts=True
+    ),
+    "minari": Format(
+        "minari:open_minari", "the folder of a Minari dataset", "data/metadata.json", _minari, parts=True
+    ),
     "maniskill": Format("maniskill:open_maniskill", "an HDF5 file of ManiSkill", fits=_maniskill),
     "act": Format("act:open_act", "the folder of ACT's episodes", "episode_0.hdf5", _act),
     "jigsaws": Format("jigsaws:open_jigsaws", "the folder of a task of JIGSAWS", "kinematics/AllGestures"),
-    "folder": Format("folder:open_folder", "a folder of HDF5 files, such as one for each task", "TASK.hdf5", _folder),
+    "folder": Format(
+        "folder:open_folder", "a folder of HDF5 files, such as one for each task", "TASK.hdf5", _folder
+    ),
     "robomimic": Format(
-        "robomimic:open_robomimic", "an HDF5 file of robomimic's layout", fits=lambda path, names: path.is_file()
+        "robomimic:open_robomimic",
+        "an HDF5 file of robomimic's layout",
+        fits=lambda path, names: path.is_file(),
     ),
 }
 """By name, in the order in which they are recognised; the reader of robomimic's files reports what is no HDF5 file."""
@@ -74,5 +83,5 @@ LAYOUTS = {
     ),
     "has the layout of RoboSet, with an episode in each Trial": ({"Trial0"}, {"Trial1"}),
 }
-"""Layouts that a few lines of Python convert, in words, and alternative sets of names that tell them: at the top of an
-HDF5 file, or in a folder and the folders within, where suffixes are names, too."""
+"""Layouts that a few lines of Python convert, in words, and alternative sets of names that tell them: at the
+top of an HDF5 file, or in a folder and the folders within, where suffixes are names, too."""

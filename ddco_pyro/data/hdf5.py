@@ -136,7 +136,9 @@ def datasets(group: h5py.Group, where: str = "", above: tuple[Any, ...] = ()) ->
         item = member(group, name, h5py.HLObject, where)
         if isinstance(item, h5py.Group):
             if item in (*above, group):
-                raise DemonstrationsError(f"{where}{name}: its groups go in a circle; write it again without that")
+                raise DemonstrationsError(
+                    f"{where}{name}: its groups go in a circle; write it again without that"
+                )
             names += [f"{name}/{below}" for below in datasets(item, f"{where}{name}/", (*above, group))]
         elif isinstance(item, h5py.Dataset):
             names.append(name)
@@ -146,21 +148,27 @@ def datasets(group: h5py.Group, where: str = "", above: tuple[Any, ...] = ()) ->
 def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
     """The dataset at ``key``, all of whose values are stored there; no value is read.
 
-    :raises DemonstrationsError: the dataset is missing, not an array, elsewhere, or partly not stored, where HDF5 would
-        read zeros.
+    :raises DemonstrationsError: the dataset is missing, not an array, elsewhere, or partly not stored, where
+        HDF5 would read zeros.
     """
     dataset = member(group, key, h5py.Dataset, where)
     where = f"{where}{key}"
     if dataset.shape is None or dataset.ndim == 0:
         raise DemonstrationsError(f"{where} has no steps; it has to be an array")
     if dataset.is_virtual or dataset.external:
-        raise _elsewhere(f"{where} is {'virtual' if dataset.is_virtual else 'stored in another file'}", dataset.file)
+        raise _elsewhere(
+            f"{where} is {'virtual' if dataset.is_virtual else 'stored in another file'}", dataset.file
+        )
     what, claimed, there = "bytes", dataset.nbytes, dataset.id.get_storage_size()
     if dataset.chunks:
         what, there = "chunks", dataset.id.get_num_chunks()
-        claimed = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+        claimed = math.prod(
+            -(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True)
+        )
     if there < claimed:
-        raise DemonstrationsError(f"{where} claims {claimed} {what}, but the file holds {there}; write it again")
+        raise DemonstrationsError(
+            f"{where} claims {claimed} {what}, but the file holds {there}; write it again"
+        )
     return dataset
 
 
@@ -189,7 +197,9 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
         try:
             item = item[part]
         except (KeyError, OSError, RuntimeError) as error:
-            raise DemonstrationsError(f"{where}{key} cannot be opened ({error}); the file may be damaged") from error
+            raise DemonstrationsError(
+                f"{where}{key} cannot be opened ({error}); the file may be damaged"
+            ) from error
     if not isinstance(item, kind):
         raise DemonstrationsError(
             f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(item).__name__.lower()}"

@@ -31,12 +31,13 @@ from ddco_pyro.events import Counted, OnEvent, ignore
 class Choice:
     """The part of a source that is imported.
 
-    :param observations: keys, or names in the source; if empty, the observations that hold numbers, without videos.
+    :param observations: keys, or names in the source; if empty, the observations that hold numbers, without
+        videos.
     :param mask: import only the demonstrations of this mask (robomimic: filter key).
     :param videos: whether videos are decoded, too.
     :param image_size: height and width to which pictures are scaled; None for no scaling.
-    :param hz: the rate to import at, Hz; None for that of the source. Numbers are means over the source's frames; a
-        picture, a label and a discrete action are those of one frame.
+    :param hz: the rate to import at, Hz; None for that of the source. Numbers are means over the source's
+        frames; a picture, a label and a discrete action are those of one frame.
     :param skip_broken: whether unusable demonstrations are left out rather than refused.
     :param actions: names in the source of the arrays that are the control together; if empty, the usual ones.
     :param labels: a table of segments that become labels.
@@ -60,8 +61,8 @@ class Imported:
 
     :param names: the demonstrations in the file.
     :param left_out: the reason for each demonstration that was left out.
-    :param notes: a line for each observation that networks cannot read or that was left out as a video, and for what
-        was left out of the table of labels.
+    :param notes: a line for each observation that networks cannot read or that was left out as a video, and
+        for what was left out of the table of labels.
     :param labelled: for labels of the table by name, the number of demonstrations in which a step is named.
     """
 
@@ -79,7 +80,8 @@ def import_demonstrations(
     choice: Choice = Choice(),
     on_event: OnEvent = ignore,
 ) -> Imported:
-    """Write the demonstrations of a file or folder, or of several that are pooled, into ``out``, whole or not at all.
+    """Write the demonstrations of a file or folder, or of several that are pooled, into ``out``, whole or not
+    at all.
 
     Of several tasks, observations that only some have are left out unless they are chosen. Memory holds one
     demonstration at a time, of pictures a block.
@@ -123,7 +125,9 @@ def import_demonstrations(
             if not written:
                 why = next(iter(left_out.values()), "there is none")
                 raise DemonstrationsError(f"{paths[0]}: none of its demonstrations can be used: {why}")
-            kept = {mask: tuple(name for name in members if name in data) for mask, members in whole.masks.items()}
+            kept = {
+                mask: tuple(name for name in members if name in data) for mask, members in whole.masks.items()
+            }
             masks |= {mask: members for mask, members in kept.items() if members}
         notes = [*_unread(whole.read(written[0]), chosen(written[0]).observations, alone), *notes]
     reasons = {name: str(error) for name, error in left_out.items()}
@@ -235,7 +239,9 @@ def _frames(frequency: float | None, hz: float) -> int:
     frames = round(frequency / hz)
     if not frames or abs(frames * hz / frequency - 1) > NEARLY:
         rates = ", ".join(f"{frequency / number:g}" for number in range(2, 6))
-        raise BadInput(f"--hz {hz:g}: the source has {frequency:g} Hz; give a whole part of that, such as {rates}")
+        raise BadInput(
+            f"--hz {hz:g}: the source has {frequency:g} Hz; give a whole part of that, such as {rates}"
+        )
     return frames
 
 
@@ -252,7 +258,11 @@ def _slower(array: Observed, frames: int) -> Observed:
 
         return replace(array, shape=(steps, *array.shape[1:]), read=read, file="")
     rows = np.asarray(array)[: steps * frames].reshape(steps, frames, *array.shape[1:])
-    return rows.mean(1, dtype=np.float64).astype(array.dtype) if array.dtype.kind == "f" else rows[:, frames // 2]
+    return (
+        rows.mean(1, dtype=np.float64).astype(array.dtype)
+        if array.dtype.kind == "f"
+        else rows[:, frames // 2]
+    )
 
 
 def _scaled(array: Observed, size: tuple[int, int]) -> Observed:

@@ -14,7 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from ddco_pyro.data.arrays import LARGEST, NUMBERS, LazyArray, Observed, blocks, is_picture, network_input, usable
+from ddco_pyro.data.arrays import (
+    LARGEST,
+    NUMBERS,
+    LazyArray,
+    Observed,
+    blocks,
+    is_picture,
+    network_input,
+    usable,
+)
 from ddco_pyro.data.coincidences import CLOCKS, Beside, Jumps, copies, generated, jumps
 from ddco_pyro.data.controls import (
     FEWEST,
@@ -49,11 +58,12 @@ SLOWEST = 0.2
 
 @dataclass
 class Field:
-    """Statistics of one array over the demonstrations that have it: ``actions``, ``obs/<key>`` or ``labels/<name>``.
+    """Statistics of one array over the demonstrations that have it: ``actions``, ``obs/<key>`` or
+    ``labels/<name>``.
 
     :param shape: of one step.
-    :param minimum: the smallest finite value of each flattened dimension, in the array's type; empty without values,
-        infinite without finite values. ``maximum`` likewise.
+    :param minimum: the smallest finite value of each flattened dimension, in the array's type; empty without
+        values, infinite without finite values. ``maximum`` likewise.
     :param nan: number of NaN.
     :param infinite: number of infinite values.
     :param huge: number of finite values beyond the largest usable number.
@@ -166,7 +176,11 @@ class Field:
             name: [float(value) if np.isfinite(value) else None for value in getattr(self, name)]
             for name in ("minimum", "maximum")
         }
-        shown: dict[str, Any] = {"dtype": str(self.dtype), "shape": [*self.shape], "values": sorted(self.values)}
+        shown: dict[str, Any] = {
+            "dtype": str(self.dtype),
+            "shape": [*self.shape],
+            "values": sorted(self.values),
+        }
         of_tasks = {task: sorted(own) for task, own in self.of_tasks.items()}
         shown |= {"demonstrations": self.demonstrations, "of_tasks": of_tasks}
         return asdict(self) | ends | shown | {"constant": self.constant, "rounding": self.rounding}
@@ -179,17 +193,18 @@ class Inspection:
     :param lengths: number of steps of each demonstration by name.
     :param problems: a line for each problem that a fit refuses.
     :param frequency: control steps per second, Hz; None if unknown.
-    :param control: statistics of each control dimension, of the control minus ``relative_to`` where there is one.
+    :param control: statistics of each control dimension, of the control minus ``relative_to`` where there is
+        one.
     :param coincidences: a line for each kind of suspicious equality.
     :param leaks: observations, ``obs/<key>``, that no policy should read, and why.
     :param relative_to: the observation of which the control is a target; None without one.
     :param excluded: names of demonstrations that were skipped.
     :param unreadable: names of demonstrations that could not be read.
-    :param clocks: a line for the first fault of each clock among observations, and for a rate that may be a period in
-        milliseconds.
+    :param clocks: a line for the first fault of each clock among observations, and for a rate that may be a
+        period in milliseconds.
     :param turns: the angles and quaternions that jump, by place of the array.
-    :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control dimension, and
-        why.
+    :param odd: names of demonstrations that are dead, unlike the others, or change the kind of a control
+        dimension, and why.
     :param attributes: of each demonstration by its name.
     :param where: what was asked of attributes.
     """
@@ -306,7 +321,9 @@ class _Inspector:
     def __init__(self, source: Source, found: Inspection) -> None:
         self.source, self.found = source, found
         self.problems = defaultdict[tuple[str, str], list[str]](list)  # messages by kind and subject
-        self.vectors: dict[str, dict[str, np.ndarray]] = {}  # controls and narrow observations, by place and name
+        self.vectors: dict[
+            str, dict[str, np.ndarray]
+        ] = {}  # controls and narrow observations, by place and name
         self.digests: dict[str, bytes] = {}
         self.traits: list[Traits] = []
 
@@ -317,7 +334,9 @@ class _Inspector:
             try:
                 places[name] = self._read(name)
             except DemonstrationsError as error:
-                self.problems["unreadable", re.sub(r"\d+", "", str(error).removeprefix(name))].append(str(error))
+                self.problems["unreadable", re.sub(r"\d+", "", str(error).removeprefix(name))].append(
+                    str(error)
+                )
                 found.unreadable.append(name)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
@@ -346,10 +365,14 @@ class _Inspector:
         varying = [dimension.number for dimension in found.control if not dimension.constant]
         beside = {}
         for array in found.observations:
-            known = {name: rows for name, rows in self.vectors.get(array.place, {}).items() if name in controls}
+            known = {
+                name: rows for name, rows in self.vectors.get(array.place, {}).items() if name in controls
+            }
             if known:
                 commands = [controls[name] for name in known]
-                beside[array.place] = Beside(array.place, [*known.values()], commands, varying, array.constant)
+                beside[array.place] = Beside(
+                    array.place, [*known.values()], commands, varying, array.constant
+                )
             why = generated(array.place) or (beside[array.place].reason if known else "")
             found.leaks |= {array.place: why} if why else {}
         if not any(dimension.integer or len(dimension.values) == 2 for dimension in found.control):
@@ -379,7 +402,9 @@ class _Inspector:
                 faults = ((name, clock_fault(rows[:, 0].astype(float), GAP)) for name, rows in each.items())
                 yield from islice((f"{place} {fault}, in {name}" for name, fault in faults if fault), 1)
 
-    def _odd(self, dimensions: Sequence[ControlDimension], controls: Mapping[str, np.ndarray]) -> dict[str, str]:
+    def _odd(
+        self, dimensions: Sequence[ControlDimension], controls: Mapping[str, np.ndarray]
+    ) -> dict[str, str]:
         """Names of demonstrations to exclude, and why.
 
         Dead ones are, and the few without which a control dimension is a switch.
@@ -387,7 +412,9 @@ class _Inspector:
         if any(dimension.integer for dimension in dimensions):
             return {}
         long = {name: rows for name, rows in controls.items() if len(rows) >= FEWEST}
-        still = {name: rows for name, rows in long.items() if same(rows.min(0).astype(float), rows.max(0)).all()}
+        still = {
+            name: rows for name, rows in long.items() if same(rows.min(0).astype(float), rows.max(0)).all()
+        }
         dead = [name for name, rows in still.items() if not rows.any()]
         others = [name for name in still if name not in dead]
         reasons = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.found.lengths) else {}
@@ -402,12 +429,15 @@ class _Inspector:
         """Read a demonstration, vectors whole and pictures in blocks; the places of its arrays."""
         demo = self.source.read(name)
         arrays = {
-            place: np.asarray(array) if _vector(place, array) else array for place, array in demo.arrays().items()
+            place: np.asarray(array) if _vector(place, array) else array
+            for place, array in demo.arrays().items()
         }
         self.found.lengths[name], self.found.attributes[name] = len(demo), demo.attributes
         task, digest, vectors = task_of(demo.attributes), hashlib.sha256(), dict[str, np.ndarray]()
         for place, array in arrays.items():
-            field = self.found.fields.get(place) or Field(place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0))
+            field = self.found.fields.get(place) or Field(
+                place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0)
+            )
             if problem := different(array, len(demo), field.shape, "the first"):
                 self.problems["shape", place].append(f"{name}: {place} {problem}")
                 continue

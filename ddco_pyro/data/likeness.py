@@ -29,20 +29,24 @@ FACTORS = {1000.0: ("millimetres", "metres"), 100.0: ("centimetres", "metres"), 
 NEAR = 2.0
 """A ratio of sizes is a factor between units if it differs from that by less.
 
-Sizes, spans and mean changes have the same ratio within twice this: a number that moves more has not other units."""
+Sizes, spans and mean changes have the same ratio within twice this: a number that moves more has not other
+units."""
 
 SURE = 0.5
-"""A demonstration agrees with the usual correlations of a control if their cosine is above; below −SURE it is reversed.
+"""A demonstration agrees with the usual correlations of a control if their cosine is above; below −SURE it is
+reversed.
 
 Reversing changes every sign; where nine in ten demonstrations are sure, none lies between by chance."""
 
 RESTS = 0.4
 """A control is a gripper's if this share of its steps lies within a tenth of its range from the ends.
 
-These are .5 and more of grippers' steps, and at most .32 of others', whose sign depends on where an object is."""
+These are .5 and more of grippers' steps, and at most .32 of others', whose sign depends on where an object
+is."""
 
 JUMP = 2.0
-"""Numbers jump if they change by so many times their usual largest change, and any other change of the demonstration.
+"""Numbers jump if they change by so many times their usual largest change, and any other change of the
+demonstration.
 
 Where recordings are joined, a quarter of the moving numbers and two at least do so at once."""
 
@@ -50,8 +54,8 @@ OTHER_RATE = 0.05
 """Rates are of other data if their logarithms differ by more."""
 
 FASTER = 2.0
-"""Where no rate is known, another one makes steps longer by this factor at least, and demonstrations shorter by about
-as much."""
+"""Where no rate is known, another one makes steps longer by this factor at least, and demonstrations shorter
+by about as much."""
 
 SAMPLED = 200
 """Steps of each demonstration, about, by which a control's range is judged."""
@@ -66,9 +70,11 @@ class Traits:
 
     :param steps: their number.
     :param sampled: some of its controls [S, A].
-    :param sizes: by place, the size, the span, and the mean and the largest change in a step of each number [4, D].
+    :param sizes: by place, the size, the span, and the mean and the largest change in a step of each number
+        [4, D].
     :param jumps: by place, the step of each largest change; -1 where another is nearly as large [D].
-    :param correlations: by place, of each control with each number, its change, and for ``actions`` time [A, F].
+    :param correlations: by place, of each control with each number, its change, and for ``actions`` time [A,
+        F].
     """
 
     name: str
@@ -84,7 +90,8 @@ class Traits:
 class Usual:
     """What the demonstrations of a fit have in common.
 
-    :param statistics: by place, the lowest, the median and the highest of each of the sizes of a number [3, 4, D].
+    :param statistics: by place, the lowest, the median and the highest of each of the sizes of a number [3,
+        4, D].
     :param correlations: of each control dimension with observations and time [A, F].
     :param agreement: the cosine with these that nine in ten demonstrations exceed [A].
     :param steps: the median number of steps.
@@ -135,14 +142,19 @@ def traits_of(name: str, task: str, arrays: Mapping[str, np.ndarray]) -> Traits:
 
 def usual(known: Sequence[Traits], frequency: float | None) -> Usual:
     """What demonstrations have in common; ``frequency`` is their rate, Hz."""
-    extremes = {place: np.quantile(each, (0, 0.5, 1), axis=0).tolist() for place, each in _sizes(known).items()}
+    extremes = {
+        place: np.quantile(each, (0, 0.5, 1), axis=0).tolist() for place, each in _sizes(known).items()
+    }
     reference, agreement = _agreement(known)
     least = np.quantile(agreement, 0.1, axis=0).tolist()
     return Usual(extremes, reference.tolist(), least, _steps(known), frequency, unlike(known))
 
 
-def unlike(known: Sequence[Traits], usual: Usual | None = None, frequency: float | None = None) -> dict[str, str]:
-    """Why demonstrations are unlike the others of their task, or unlike the usual ones of a fit, by their names.
+def unlike(
+    known: Sequence[Traits], usual: Usual | None = None, frequency: float | None = None
+) -> dict[str, str]:
+    """Why demonstrations are unlike the others of their task, or unlike the usual ones of a fit, by their
+    names.
 
     :param frequency: control steps per second of these demonstrations, Hz.
     """
@@ -165,7 +177,7 @@ def reasons_told(reasons: Mapping[str, str], number: int, remedy: str = "") -> l
     return [f"{few(members)} ({len(members)} of {number}): {why}{remedy}" for why, members in names.items()]
 
 
-# --- reasons, each with the names of its demonstrations ---------------------------------------------------------------
+# --- reasons, each with the names of its demonstrations -----------------------------------------------------
 
 
 def _other_units(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple[str, Sequence[str]]]:
@@ -210,9 +222,13 @@ def _other_rate(
         if abs(math.log(frequency / usual.frequency)) > OTHER_RATE:
             yield f"{frequency:g} Hz, and {usual.frequency:g} Hz in the fit", names
         return
-    seen = {place: np.median(sizes[:, 2], axis=0) for place, sizes in _sizes(known).items() if place != "actions"}
+    seen = {
+        place: np.median(sizes[:, 2], axis=0) for place, sizes in _sizes(known).items() if place != "actions"
+    }
     with np.errstate(all="ignore"):
-        ratios = np.concatenate([[1.0], *(own / usual.statistics[place][1][2] for place, own in seen.items())])
+        ratios = np.concatenate(
+            [[1.0], *(own / usual.statistics[place][1][2] for place, own in seen.items())]
+        )
     faster = float(np.median(ratios[np.isfinite(ratios) & (ratios > 0)]))
     shorter = usual.steps / _steps(known)
     if max(faster, 1 / faster) >= FASTER and 1 / FASTER < faster / shorter < FASTER:
@@ -224,7 +240,11 @@ def _joined(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple[str,
     if not (places := [place for place in _shared(known) if place != "actions"]):
         return
     changes = np.stack([np.concatenate([one.sizes[place][3] for place in places]) for one in known])
-    usually = np.concatenate([usual.statistics[place][1][3] for place in places]) if usual else np.median(changes, 0)
+    usually = (
+        np.concatenate([usual.statistics[place][1][3] for place in places])
+        if usual
+        else np.median(changes, 0)
+    )
     found: dict[str, int] = {}
     for one, largest in zip(known, changes, strict=True):
         at = np.concatenate([one.jumps[place] for place in places])
@@ -233,7 +253,10 @@ def _joined(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple[str,
             found[one.name] = int(together.argmax()) + 1
     if found and (usual or 2 * len(found) <= len(known)):
         first, step = next(iter(found.items()))
-        yield f"observations jump at once, in {first} at step {step}: perhaps two recordings are joined", [*found]
+        yield (
+            f"observations jump at once, in {first} at step {step}: perhaps two recordings are joined",
+            [*found],
+        )
 
 
 def _steps(known: Sequence[Traits]) -> float:
@@ -264,7 +287,8 @@ def _agreement(known: Sequence[Traits], usual: Usual | None = None) -> tuple[np.
 
 
 def _ratios(own: np.ndarray, usual: np.ndarray) -> np.ndarray:
-    """How many times its usual size a number has in each demonstration [N]; 0 where its units are the usual ones.
+    """How many times its usual size a number has in each demonstration [N]; 0 where its units are the usual
+    ones.
 
     :param own: sizes, spans and mean changes [N, 3]; ``usual`` [n, 3].
     """
@@ -283,7 +307,9 @@ def _times(ratio: float, usual: Usual | None) -> str:
     units = " for ".join(FACTORS[factor] if ratio > 1 else FACTORS[factor][::-1])
     if not 1 / NEAR < size / factor < NEAR:
         factor, units = float(f"{size:.1g}"), "other units"
-    return f"about {factor:g} times as {'large' if ratio > 1 else 'small'} as {_where(usual)}, perhaps {units}"
+    return (
+        f"about {factor:g} times as {'large' if ratio > 1 else 'small'} as {_where(usual)}, perhaps {units}"
+    )
 
 
 def _where(usual: Usual | None) -> str:
@@ -309,7 +335,9 @@ def _correlations(controls: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Correlations over time [A, F] of controls [T, A] with values [T, F]; 0 where one of both is constant."""
     left, right = (array - array.mean(0) for array in (controls, values))
     with np.errstate(all="ignore"):
-        return np.nan_to_num(left.T @ right / np.outer(*(np.linalg.norm(array, axis=0) for array in (left, right))))
+        return np.nan_to_num(
+            left.T @ right / np.outer(*(np.linalg.norm(array, axis=0) for array in (left, right)))
+        )
 
 
 def _cosines(each: np.ndarray, reference: np.ndarray) -> np.ndarray:

@@ -25,9 +25,9 @@ NOISE = 0.003
 def pick_and_place(count: int = 40, seed: int = 0) -> Demonstrations:
     """A point gripper fetches an object: it reaches, grasps, carries and releases.
 
-    Observations are the positions of ``gripper``, ``object`` and ``goal`` [3] in metres, and the opening of the ``jaw``
-    [1] from 0 to 1. The control is the gripper's velocity in metres a step and the jaw's command, −1 or 1. The label
-    ``phase`` is the skill.
+    Observations are the positions of ``gripper``, ``object`` and ``goal`` [3] in metres, and the opening of
+    the ``jaw`` [1] from 0 to 1. The control is the gripper's velocity in metres a step and the jaw's command,
+    −1 or 1. The label ``phase`` is the skill.
 
     >>> demos = pick_and_place(2)
     >>> demos.observation_shapes, demos.control_size, sorted(set(demos[0].labels["phase"].tolist()))
@@ -57,5 +57,10 @@ def _episode(random: np.random.Generator) -> Iterator[tuple[dict[str, np.ndarray
         jaw = float(np.clip(jaw + 0.25 * command, 0, 1))
         thing = gripper if phase == 2 else thing
         rest -= int(phase == 3 and jaw == 1)
-        done = (np.linalg.norm(gripper - thing) < NEAR, jaw == 0, np.linalg.norm(gripper - goal) < NEAR, False)
+        done = (
+            np.linalg.norm(gripper - thing) < NEAR,
+            jaw == 0,
+            np.linalg.norm(gripper - goal) < NEAR,
+            False,
+        )
         phase += int(done[phase])

@@ -57,8 +57,8 @@ EXACT_EPOCHS = 500
 VECTORS = (1000, 6000, 200)
 """Steps in a minibatch and gradient steps of a model, about, and its fewest epochs.
 
-About a minute on one core. The hierarchy and the baselines converge on the files of docs/decisions.md; with a patience
-of 20, flat policies stopped too early there."""
+About a minute on one core. The hierarchy and the baselines converge on the files of docs/decisions.md; with a
+patience of 20, flat policies stopped too early there."""
 
 PICTURES = (250, 4000, 20)
 """The same. About six minutes on one core for each model, with pictures of 48 × 64 pixels."""
@@ -81,7 +81,9 @@ class Decided(NamedTuple):
     power: float = 0.5
     constant: bool = False
     window: int = 0
-    why: str = "times the control's log-density counts: less makes options last longer, as init --segment 2s does"
+    why: str = (
+        "times the control's log-density counts: less makes options last longer, as init --segment 2s does"
+    )
     heavy: tuple[int, ...] = ()
     moved: str = ""
 
@@ -103,12 +105,14 @@ def starting_spec(
     otherwise the affected observations are left out. Comments say why.
 
     :param hold_out_by: the attribute of demonstrations whose values are not to be on both sides of the split.
-    :raises DemonstrationsError: nothing can be fitted to the demonstrations, or the attribute cannot divide them.
+    :raises DemonstrationsError: nothing can be fitted to the demonstrations, or the attribute cannot divide
+        them.
     """
     facts, reasons = _usable_part(inspection)
     observed, masks = facts.observations, [] if hold_out_by not in (None, EACH) else list(facts.masks)
     vectors, images = (
-        [field for field in observed if field.image is image and not _left_out(facts, field)] for image in (False, True)
+        [field for field in observed if field.image is image and not _left_out(facts, field)]
+        for image in (False, True)
     )
     if not (vectors or images):
         why = next((f": {field.place} {_left_out(facts, field)}" for field in observed), "")
@@ -198,7 +202,9 @@ def _relative(vectors: Sequence[Field]) -> list[tuple[str, str]]:
     """Positions and that of the hand, to which they may be relative, by the ends ``_pos`` of their names."""
     positions = {field.key: field.shape for field in vectors if field.key.endswith(("_pos", "_position"))}
     hand = next((key for key in positions if HANDS.search(key)), "")
-    return [(key, hand) for key, shape in positions.items() if hand and key != hand and shape == positions[hand]]
+    return [
+        (key, hand) for key, shape in positions.items() if hand and key != hand and shape == positions[hand]
+    ]
 
 
 def _held_out(inspection: Inspection, attribute: str) -> str:
@@ -211,7 +217,9 @@ def _held_out(inspection: Inspection, attribute: str) -> str:
     except DemonstrationsError as error:
         raise DemonstrationsError(f"{inspection.path}: {error}") from None
     number = sum(map(len, found.values()))
-    return printable(f"held out: {attribute} {', '.join(found)}, {number} of {len(inspection.lengths)} demonstrations")
+    return printable(
+        f"held out: {attribute} {', '.join(found)}, {number} of {len(inspection.lengths)} demonstrations"
+    )
 
 
 def _fullest_first(labels: Sequence[Field]) -> list[Field]:
@@ -250,12 +258,17 @@ def _valid_fraction(number: int) -> float:
 
 
 def _few_affected(inspection: Inspection) -> list[str]:
-    """The demonstrations to exclude so that no array has to be left out: those with unusable values, if they are few.
+    """The demonstrations to exclude so that no array has to be left out: those with unusable values, if they
+    are few.
 
     An array that is affected in many demonstrations, or absent in some, is left out in any case.
     """
     most = MOST_EXCLUDED * len(inspection.lengths)
-    keys = [field for field in (inspection.actions, *inspection.observations) if field and inspection.everywhere(field)]
+    keys = [
+        field
+        for field in (inspection.actions, *inspection.observations)
+        if field and inspection.everywhere(field)
+    ]
     names = {name for field in keys if len(field.affected) <= most for name in field.affected}
     fits = len(names) <= most and _divides(inspection, names)
     return [name for name in inspection.lengths if name in names] if fits else []
@@ -263,7 +276,9 @@ def _few_affected(inspection: Inspection) -> list[str]:
 
 def _divides(inspection: Inspection, without: Collection[str]) -> bool:
     """Whether enough demonstrations for a fit are left without these."""
-    masks = {mask: [name for name in members if name not in without] for mask, members in inspection.masks.items()}
+    masks = {
+        mask: [name for name in members if name not in without] for mask, members in inspection.masks.items()
+    }
     try:
         check_division([name for name in inspection.lengths if name not in without], masks)
     except DemonstrationsError:

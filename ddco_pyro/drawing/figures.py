@@ -63,7 +63,9 @@ def picture(pixels: np.ndarray, alt: str, caption: str = "") -> Drawing:
 
     :param alt: what is said where it cannot be seen.
     """
-    return Drawing(Markup('<img src="{}" alt="{}">').format(data_uri(jpeg(pixels), "image/jpeg"), alt), caption)
+    return Drawing(
+        Markup('<img src="{}" alt="{}">').format(data_uri(jpeg(pixels), "image/jpeg"), alt), caption
+    )
 
 
 def film(content: bytes, caption: str) -> Drawing:
@@ -92,7 +94,9 @@ class Interval:
     colour: str = INK
 
     @classmethod
-    def around(cls, value: float, error: float | None, points: Sequence[float] = (), colour: str = INK) -> Interval:
+    def around(
+        cls, value: float, error: float | None, points: Sequence[float] = (), colour: str = INK
+    ) -> Interval:
         """The value ± an error, which may be unknown."""
         half = np.nan if error is None else error
         return cls(value, value - half, value + half, points, colour=colour)
@@ -105,7 +109,13 @@ class Interval:
     @property
     def numbers(self) -> list[float]:
         """All numbers that are drawn."""
-        every = [self.value, self.low, self.high, *self.points, *([] if self.hollow is None else [self.hollow])]
+        every = [
+            self.value,
+            self.low,
+            self.high,
+            *self.points,
+            *([] if self.hollow is None else [self.hollow]),
+        ]
         return [number for number in every if np.isfinite(number)]
 
 
@@ -124,7 +134,9 @@ class Panel:
     band: tuple[float, float] | None = None
 
 
-def interval_plot(names: Sequence[str], panels: Sequence[Panel], alt: str, notes: Sequence[str] = ()) -> Markup:
+def interval_plot(
+    names: Sequence[str], panels: Sequence[Panel], alt: str, notes: Sequence[str] = ()
+) -> Markup:
     """A forest plot: a row for each name, panels side by side, and ``notes`` below, a line each."""
     left = min(12 + 6.2 * max(map(len, names)), WIDTH / 2)  # of longer names the ends are seen
     height = TITLE + ROW * len(names) + AXIS
@@ -134,7 +146,9 @@ def interval_plot(names: Sequence[str], panels: Sequence[Panel], alt: str, notes
     for number, panel in enumerate(panels):
         each = (WIDTH - left) / len(panels)
         parts += _panel(panel, left + number * each, each - 14, TITLE + ROW * len(names))
-    parts += [words_at(4, height + 15 * place, text, "start", "soft") for place, text in enumerate(notes, start=1)]
+    parts += [
+        words_at(4, height + 15 * place, text, "start", "soft") for place, text in enumerate(notes, start=1)
+    ]
     return svg(WIDTH, height + 15 * len(notes) + 4, alt, parts)
 
 
@@ -174,13 +188,15 @@ def _panel(panel: Panel, left: float, width: float, bottom: float) -> list[str]:
         if row and np.isfinite(row.low):
             looks = f'stroke="{row.colour}" stroke-width="1.4"'
             parts += [vertical(at(end), y - 4, y + 4, looks) for end in (row.low, row.high)]
-            parts.append(f'<line x1="{at(row.low):.1f}" y1="{y:.1f}" x2="{at(row.high):.1f}" y2="{y:.1f}" {looks}/>')
+            parts.append(
+                f'<line x1="{at(row.low):.1f}" y1="{y:.1f}" x2="{at(row.high):.1f}" y2="{y:.1f}" {looks}/>'
+            )
         if row and np.isfinite(row.value):
             parts.append(f'<circle cx="{at(row.value):.1f}" cy="{y:.1f}" r="4" fill="{row.colour}"/>')
     return parts
 
 
-# --- transitions between options --------------------------------------------------------------------------------------
+# --- transitions between options ----------------------------------------------------------------------------
 
 RAREST = 0.01
 """Transitions that make up a smaller share of all are not drawn; starts and ends, of all demonstrations."""
@@ -189,11 +205,13 @@ LETTERS = 16
 """Of a name beside a node, at most."""
 
 
-def transition_graph(counts: np.ndarray, shares: Sequence[float], names: Sequence[str], order: Sequence[int]) -> Markup:
+def transition_graph(
+    counts: np.ndarray, shares: Sequence[float], names: Sequence[str], order: Sequence[int]
+) -> Markup:
     """Options in a row between start and end; arcs above the row lead to the right, arcs below to the left.
 
-    :param counts: of transitions between segments [1 + k + 1, 1 + k + 1]; the last row is the start of demonstrations
-        and the last column their end.
+    :param counts: of transitions between segments [1 + k + 1, 1 + k + 1]; the last row is the start of
+        demonstrations and the last column their end.
     :param shares: of steps, of each choice; the areas of nodes.
     :param order: the choices that are drawn, from left to right.
     """
@@ -206,10 +224,13 @@ def transition_graph(counts: np.ndarray, shares: Sequence[float], names: Sequenc
         (first, second, int(counts[first, second]))
         for first in starts
         for second in ends
-        if counts[first, second] >= max(1, RAREST * (counts[outside] if outside in (first, second) else counts).sum())
+        if counts[first, second]
+        >= max(1, RAREST * (counts[outside] if outside in (first, second) else counts).sum())
     ]
     up = max((_rise(ends[b] - starts[a], gap) for a, b, _ in edges if ends[b] > starts[a]), default=0.0) + 34
-    down = max((_rise(starts[a] - ends[b], gap) for a, b, _ in edges if ends[b] < starts[a]), default=0.0) + 58
+    down = (
+        max((_rise(starts[a] - ends[b], gap) for a, b, _ in edges if ends[b] < starts[a]), default=0.0) + 58
+    )
     parts: list[str] = []
     for first, second, count in sorted(edges, key=lambda edge: edge[2]):
         target = "end" if second == outside else named[second]
@@ -225,10 +246,14 @@ def transition_graph(counts: np.ndarray, shares: Sequence[float], names: Sequenc
                 '<g><title>{}</title><circle cx="{:.1f}" cy="{:.1f}" r="{:.1f}" fill="{}" stroke="var(--line)"/></g>'
             ).format(title, x, up, radius, option_colour(choice))
         )
-        parts.append(words_at(x, up + radius + 14, name if len(name) <= LETTERS else name[: LETTERS - 1] + "…"))
+        parts.append(
+            words_at(x, up + radius + 14, name if len(name) <= LETTERS else name[: LETTERS - 1] + "…")
+        )
     for x, word in ((starts[outside], "start"), (ends[outside], "end")):
         parts.append(
-            Markup('<circle cx="{:.1f}" cy="{:.1f}" r="5" fill="var(--paper)" stroke="var(--ink)"/>').format(x, up)
+            Markup('<circle cx="{:.1f}" cy="{:.1f}" r="5" fill="var(--paper)" stroke="var(--ink)"/>').format(
+                x, up
+            )
         )
         parts.append(words_at(x, up + 20, word, kind="soft"))
     return svg(WIDTH, up + down, "Transitions between options", parts)
@@ -256,7 +281,7 @@ def _edge(start: float, end: float, y: float, gap: float, share: float, title: s
     ).format(0.45 + 0.55 * share, title, path, width, head, words_at(middle, top - 7, count))
 
 
-# --- instances of an option -------------------------------------------------------------------------------------------
+# --- instances of an option ---------------------------------------------------------------------------------
 
 CELL = 110.0
 """Units across a cell of the grid of instances."""
@@ -285,7 +310,9 @@ def line(points: np.ndarray, **looks: Any) -> Markup:
     return Markup('<polyline points="{}" fill="none"{}/>').format(drawn, attributes)
 
 
-def typical_paths(paths: Sequence[np.ndarray], segments: Sequence[tuple[int, int, int]], colour: str) -> Markup:
+def typical_paths(
+    paths: Sequence[np.ndarray], segments: Sequence[tuple[int, int, int]], colour: str
+) -> Markup:
     """Segments in colour over whole demonstrations; circle, square and triangle: first, middle and last step.
 
     :param paths: of demonstrations in the plane [P, T, 2].
@@ -313,7 +340,8 @@ MOST_PATHS = 40
 def paths_of_options(paths: Sequence[np.ndarray], options: Sequence[np.ndarray]) -> Markup:
     """Whole demonstrations, each step in the colour of its option; a circle is a first step.
 
-    :param paths: of demonstrations in the plane [P, T, 2]; at most :data:`MOST_PATHS` of them are drawn, evenly spread.
+    :param paths: of demonstrations in the plane [P, T, 2]; at most :data:`MOST_PATHS` of them are drawn,
+        evenly spread.
     :param options: the most likely options of each [T].
     """
     rows = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), MOST_PATHS)).round().astype(int))
@@ -323,8 +351,12 @@ def paths_of_options(paths: Sequence[np.ndarray], options: Sequence[np.ndarray])
         for place, path in enumerate(placed):
             looks = {"stroke_width": 1.5, "stroke_dasharray": DASHES[LINES[place % len(LINES)]]}
             for start, end in zip(starts, [*starts[1:], len(path) - 1], strict=True):
-                parts.append(line(path[start : end + 1], stroke=option_colour(int(options[row][start])), **looks))
-            parts.append('<circle cx="{:.1f}" cy="{:.1f}" r="3" fill="white" stroke="#222222"/>'.format(*path[0]))
+                parts.append(
+                    line(path[start : end + 1], stroke=option_colour(int(options[row][start])), **looks)
+                )
+            parts.append(
+                '<circle cx="{:.1f}" cy="{:.1f}" r="3" fill="white" stroke="#222222"/>'.format(*path[0])
+            )
     return svg(WIDTH, WIDTH / 2, "Trajectories coloured by option", parts)
 
 
@@ -344,7 +376,9 @@ def curves(
     for place, (name, each) in enumerate(values.items()):
         low, high = min(array.min() for array in each), max(array.max() for array in each)
         longest = max(max(map(len, each)) - 1, 1)
-        parts.append(f'<g transform="translate({width * (place % columns):.0f},{height * (place // columns):.0f})">')
+        parts.append(
+            f'<g transform="translate({width * (place % columns):.0f},{height * (place // columns):.0f})">'
+        )
         parts.append(f'<rect x="2" y="16" width="{width - 8:.0f}" height="{height - 22:.0f}" class="faint"/>')
         parts += [words_at(2, 11, name, "start"), words_at(width - 9, 26, f"{high:.3g}", "end", "soft")]
         parts.append(words_at(width - 9, height - 9, f"{low:.3g}", "end", "soft"))

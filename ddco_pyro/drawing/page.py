@@ -61,7 +61,9 @@ class Table:
     def folded(self, shown: int, what: str) -> list[Block]:
         """The first rows; the others are folded, and ``what`` names them, such as ``demonstrations``."""
         first, rest = (Table(self.head, rows, self.left) for rows in (self.rows[:shown], self.rows[shown:]))
-        return [first, Card(f"The other {len(rest.rows)} {what}", [rest], folded=True)] if rest.rows else [first]
+        return (
+            [first, Card(f"The other {len(rest.rows)} {what}", [rest], folded=True)] if rest.rows else [first]
+        )
 
 
 def _line(cells: Sequence[str]) -> str:
@@ -152,7 +154,9 @@ class Page:
     @property
     def has_timelines(self) -> bool:
         """Whether the page needs the script of time lines."""
-        return any(isinstance(block, Timelines) for section in self.sections if section for block in section.blocks)
+        return any(
+            isinstance(block, Timelines) for section in self.sections if section for block in section.blocks
+        )
 
     def html(self) -> str:
         """One self-contained file. Text is escaped unless it is ``markupsafe.Markup``."""
@@ -168,7 +172,9 @@ class Page:
     def markdown(self) -> str:
         """Text and tables in Markdown, beginning with the blocks under the title."""
         parts = [_markdown(self.blocks)]
-        parts += [f"## {section.title}\n\n{_markdown(section.blocks)}" for section in self.sections if section]
+        parts += [
+            f"## {section.title}\n\n{_markdown(section.blocks)}" for section in self.sections if section
+        ]
         return "\n\n".join(filter(None, parts)) + "\n"
 
 
@@ -179,6 +185,8 @@ def _kind(block: Any) -> str:
 def _markdown(blocks: Sequence[Block]) -> str:
     flat = chain.from_iterable(block.blocks if isinstance(block, Card) else [block] for block in blocks)
     shown = (
-        block.text if isinstance(block, Text) else block.markdown() for block in flat if isinstance(block, Table | Text)
+        block.text if isinstance(block, Text) else block.markdown()
+        for block in flat
+        if isinstance(block, Table | Text)
     )
     return "\n\n".join(filter(None, shown))

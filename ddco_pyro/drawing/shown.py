@@ -24,7 +24,7 @@ MOST_SKIPPED = 4
 """Steps of a stretch that is read whole, for each of its pictures that is shown."""
 
 
-# --- paths in space ---------------------------------------------------------------------------------------------------
+# --- paths in space -----------------------------------------------------------------------------------------
 
 
 def positions(demo: Demonstration, paths: Sequence[PathSpec]) -> np.ndarray:
@@ -51,15 +51,17 @@ LINES = ("solid", "dashed", "dotted")
 def projection(points: np.ndarray) -> np.ndarray:
     """The map [2, D] from positions [M, D] to a plane, right and down.
 
-    The second axis of a plane points up, and both have one scale. Space is seen along the direction in which positions
-    spread the least, with the third axis upright: from 15 to 45 degrees above, and along no axis.
+    The second axis of a plane points up, and both have one scale. Space is seen along the direction in which
+    positions spread the least, with the third axis upright: from 15 to 45 degrees above, and along no axis.
     """
     span = np.ptp(points, axis=0)
     span = np.where(span > 0, span, 1.0)
     if len(span) == 2:
         return np.array([[1.0, 0.0], [0.0, -1.0]]) / span.max()
     scale = span if span.max() > MOST_STRETCHED * span.min() else np.full(3, span.max())
-    normal = np.linalg.eigh(np.cov((points / (scale / scale.max())).T))[1][:, 0] if len(points) > 1 else np.ones(3)
+    normal = (
+        np.linalg.eigh(np.cov((points / (scale / scale.max())).T))[1][:, 0] if len(points) > 1 else np.ones(3)
+    )
     normal = -normal if normal[2] < 0 else normal
     up = np.radians(np.clip(np.degrees(np.arcsin(normal[2])), 15, 45))
     quarter, rest = divmod(float(np.degrees(np.arctan2(normal[1], normal[0]))), 90)
@@ -69,7 +71,7 @@ def projection(points: np.ndarray) -> np.ndarray:
     return np.array([right, down]) / scale
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
+# --- pictures -----------------------------------------------------------------------------------------------
 
 
 def pictures(demos: Iterable[Demonstration]) -> list[Observed]:
@@ -109,7 +111,9 @@ def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -
     coloured = read[..., :3] if read.shape[-1] >= 3 else np.repeat(read[..., :1], 3, axis=-1)
     width = max(1, round(height * read.shape[2] / read.shape[1]))
     how = cv2.INTER_AREA if height < read.shape[1] else cv2.INTER_NEAREST
-    sized = [cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=how) for picture in coloured]
+    sized = [
+        cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=how) for picture in coloured
+    ]
     return np.stack(sized)[np.searchsorted(chosen, steps)]
 
 

@@ -36,11 +36,11 @@ PICTURE_HEIGHT = 96
 class Timelines:
     """Demonstrations under one axis of time.
 
-    :param lanes: the rows of every demonstration, a level of options or labels each: its ``name``, and the ``names``
-        and ``colours`` of its values, by value.
-    :param tracks: of each demonstration ``name``, ``steps``, ``held_out``, a line of ``facts``, the ``anchor`` by which
-        links lead to it, its ``lanes`` (:func:`coded`; None of one that it lacks), and what follows the cursor
-        (:func:`following`).
+    :param lanes: the rows of every demonstration, a level of options or labels each: its ``name``, and the
+        ``names`` and ``colours`` of its values, by value.
+    :param tracks: of each demonstration ``name``, ``steps``, ``held_out``, a line of ``facts``, the
+        ``anchor`` by which links lead to it, its ``lanes`` (:func:`coded`; None of one that it lacks), and
+        what follows the cursor (:func:`following`).
     :param frequency: steps per second (Hz); None where unknown.
     :param rows: demonstrations that are seen at once, about; None for as many as a window has room for.
     """
@@ -68,7 +68,8 @@ def coded(
 
     :param starts: first steps.
     :param values: the option or the label of each segment.
-    :param intervals: of each first step, [segments, 2]; None for labels. Those that are a single step are left out.
+    :param intervals: of each first step, [segments, 2]; None for labels. Those that are a single step are
+        left out.
     :param probability: of the option at each step [T]; None for labels.
     """
     found: dict[str, Any] = {"s": list(starts), "v": list(values)}
@@ -100,7 +101,9 @@ def following(
         every = -(-len(values) * steps // MOST_BYTES) or 1
         low = np.array([array.min() for array in values.values()])
         span = np.array([np.ptp(array) for array in values.values()])
-        scaled = [255 * (array - a) / (b or 1) for array, a, b in zip(values.values(), low, span, strict=True)]
+        scaled = [
+            255 * (array - a) / (b or 1) for array, a, b in zip(values.values(), low, span, strict=True)
+        ]
         found: dict[str, Any] = {}
         if values:
             coded = text(np.rint([array[::every] for array in scaled]))
@@ -120,7 +123,8 @@ def following(
 
 
 def _numbers(demo: Demonstration, paths: Sequence[PathSpec]) -> tuple[dict[str, np.ndarray], list[list[int]]]:
-    """Numbers over time by name: those of paths, all controls, then observations; and the places of each path's.
+    """Numbers over time by name: those of paths, all controls, then observations; and the places of each
+    path's.
 
     There are :data:`MOST_NUMBERS` in all, or more where paths and controls alone are more.
     """
@@ -128,7 +132,9 @@ def _numbers(demo: Demonstration, paths: Sequence[PathSpec]) -> tuple[dict[str, 
     arrays = {"control": demo.actions.reshape(len(demo), -1), **vectors}
     drawn = [[(path.key, place) for place in path.among(vectors[path.key].shape[1])] for path in paths]
     first = list(dict.fromkeys(chain.from_iterable(drawn)))
-    every = dict.fromkeys([*first, *((key, place) for key, array in arrays.items() for place in range(array.shape[1]))])
+    every = dict.fromkeys(
+        [*first, *((key, place) for key, array in arrays.items() for place in range(array.shape[1]))]
+    )
     values = {
         f"{key}[{place}]" if arrays[key].shape[1] > 1 else key: arrays[key][:, place].astype(float)
         for key, place in islice(every, max(MOST_NUMBERS, len(first) + arrays["control"].shape[1]))

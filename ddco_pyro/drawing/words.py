@@ -54,7 +54,9 @@ def percent(value: float | None, digits: int = 0) -> str:
 
 def interval(value: Sequence[float] | None, scale: float = 1.0, digits: int = 2) -> str:
     """``low to high``."""
-    return "–" if value is None else f"{number(scale * value[0], digits)} to {number(scale * value[1], digits)}"
+    return (
+        "–" if value is None else f"{number(scale * value[0], digits)} to {number(scale * value[1], digits)}"
+    )
 
 
 def duration(frequency: float | None, *steps: float) -> str:
@@ -94,7 +96,9 @@ def over_seeds(name: str, values: Sequence[float]) -> str:
     :param name: of :data:`~ddco_pyro.metrics.METRICS`.
     """
     _, _, scale, digits = METRICS[name]
-    return f"{signed(scale * float(np.mean(values)), digits)} [{interval(mean_interval(values), scale, digits)}]"
+    return (
+        f"{signed(scale * float(np.mean(values)), digits)} [{interval(mean_interval(values), scale, digits)}]"
+    )
 
 
 def of_episodes(pair: Against | None) -> str:
@@ -106,7 +110,11 @@ def of_episodes(pair: Against | None) -> str:
 
 def spread(values: Sequence[float]) -> tuple[str, str, str]:
     """Mean, 95 % t interval of the mean, and range of a few values."""
-    return number(float(np.mean(values))), interval(mean_interval(values)), interval((min(values), max(values)))
+    return (
+        number(float(np.mean(values))),
+        interval(mean_interval(values)),
+        interval((min(values), max(values))),
+    )
 
 
 def with_error(difference: Difference | None, digits: int = 2) -> str:

@@ -1,12 +1,12 @@
 """Agreement of segments with ground-truth labels, by the measures of the field.
 
-Normalised mutual information (NMI), the adjusted Rand index (ARI) and boundary F1 do not depend on the names of
-options. For the other measures options are matched one to one with labels, so that as many steps as possible agree
-(Hungarian assignment): *globally*, once for all demonstrations, or *per demonstration*. An unmatched option, or one
-that shares no step with its label, agrees with nothing.
+Normalised mutual information (NMI), the adjusted Rand index (ARI) and boundary F1 do not depend on the names
+of options. For the other measures options are matched one to one with labels, so that as many steps as
+possible agree (Hungarian assignment): *globally*, once for all demonstrations, or *per demonstration*. An
+unmatched option, or one that shares no step with its label, agrees with nothing.
 
-Steps labelled :data:`UNKNOWN` are left out. A segment is a maximal run of steps of the same option: selecting the same
-option anew is no boundary.
+Steps labelled :data:`UNKNOWN` are left out. A segment is a maximal run of steps of the same option: selecting
+the same option anew is no boundary.
 """
 
 from __future__ import annotations
@@ -38,13 +38,18 @@ UNMATCHED = ("nmi", "ari", *(f"boundary_f1_{steps}" for steps in TOLERANCES))
 MATCHED = tuple(Matched.model_fields)
 
 
-def agreement(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray], tasks: Sequence[str] = ()) -> Scores | None:
+def agreement(
+    segments: Sequence[np.ndarray], labels: Sequence[np.ndarray], tasks: Sequence[str] = ()
+) -> Scores | None:
     """All measures over demonstrations, each at most 1 (perfect); None where no step has a known label.
 
-    Of several tasks, measures are means over tasks: options are matched with the labels of one task at a time.
+    Of several tasks, measures are means over tasks: options are matched with the labels of one task at a
+    time.
 
-    :data:`EXPLAINED` says what they measure. Boundaries are matched one to one; where neither side has any, their F1 is
-    1. A segment is compared with the segment of its label with which it overlaps most, and that is taken once.
+    :data:`EXPLAINED` says what they measure. Boundaries are matched one to one; where neither side has any,
+    their F1 is
+    1. A segment is compared with the segment of its label with which it overlaps most, and that is taken
+       once.
 
     >>> found = agreement([np.array([7, 7, 3, 3])], [np.array([0, 0, 0, 1])])
     >>> found.matched_globally.accuracy, found.boundary_f1_1
@@ -117,7 +122,8 @@ def of_equal_lengths(
 
     Of several tasks, into as many as options are used in the task (:data:`USED`).
 
-    :param segments: the options [T] of each demonstration, of several tasks; ``tasks`` as of :func:`agreement`.
+    :param segments: the options [T] of each demonstration, of several tasks; ``tasks`` as of
+        :func:`agreement`.
     """
     if not are_several(tasks):
         return agreement([equal_lengths(len(own), count) for own in labels], labels)
@@ -145,7 +151,9 @@ def confusion(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> C
     )
 
 
-def _known(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+def _known(
+    segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Options and labels of the steps with a known label, for each demonstration with such steps."""
     pairs = []
     for options, label in zip(segments, labels, strict=True):
@@ -157,7 +165,8 @@ def _known(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> list
 
 
 def _numbered(sequences: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The distinct values, and each sequence with values replaced by numbers in the order of first appearance.
+    """The distinct values, and each sequence with values replaced by numbers in the order of first
+    appearance.
 
     The choice between equally good matchings then does not depend on names.
     """
@@ -209,7 +218,8 @@ def _boundary_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], tolera
 
 
 def boundary_distances(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> np.ndarray:
-    """Distances of sorted steps that are matched one to one within a tolerance: most pairs, and the closest of these.
+    """Distances of sorted steps that are matched one to one within a tolerance: most pairs, and the closest
+    of these.
 
     >>> boundary_distances(np.array([10, 12]), np.array([12, 40]), 3).tolist()
     [0]
@@ -240,7 +250,7 @@ def _overlap_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], overlap
     return 2 * right / segments
 
 
-# --- tables -----------------------------------------------------------------------------------------------------------
+# --- tables -------------------------------------------------------------------------------------------------
 
 MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
 
@@ -278,7 +288,7 @@ def agreement_table(scores: Mapping[str, Scores | None]) -> Table:
     return Table(head, rows, {0, 1 + len(UNMATCHED)})
 
 
-# --- two annotators ---------------------------------------------------------------------------------------------------
+# --- two annotators -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -286,8 +296,10 @@ class Annotators:
     """How two annotators agree. Boundaries are compared where both say something of the steps on both sides.
 
     :param demonstrations: which both have.
-    :param steps: of these demonstrations; ``both`` of them are said by both annotators, ``same`` with the same name.
-    :param kappa: Cohen's κ over the steps that both said; None without such steps, or where there is one name alone.
+    :param steps: of these demonstrations; ``both`` of them are said by both annotators, ``same`` with the
+        same name.
+    :param kappa: Cohen's κ over the steps that both said; None without such steps, or where there is one name
+        alone.
     :param boundaries: the number of each annotator.
     :param distances: of the boundaries that match within the tolerance, in steps, sorted.
     :param names: in the order of their numbers.
@@ -322,7 +334,9 @@ def compare_annotators(first: str | Path, second: str | Path, tolerance: int) ->
     known = [our_names, their_names]
     shared = [name for name in ours if name in theirs]
     if not shared:
-        raise BadInput(f"{second}: has none of the demonstrations of {first}; name a file with other labels of them")
+        raise BadInput(
+            f"{second}: has none of the demonstrations of {first}; name a file with other labels of them"
+        )
     labels: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for demo in shared:
         a, b = ours[demo], theirs[demo]
@@ -335,7 +349,10 @@ def compare_annotators(first: str | Path, second: str | Path, tolerance: int) ->
         raise BadInput(f"{second}: has no labels that {first} has, too; labels of the same name are compared")
     return {
         name: compared(
-            name, pairs, [own.get(name) or known[1 - n].get(name, []) for n, own in enumerate(known)], tolerance
+            name,
+            pairs,
+            [own.get(name) or known[1 - n].get(name, []) for n, own in enumerate(known)],
+            tolerance,
         )
         for name, pairs in sorted(labels.items())
     }
@@ -367,14 +384,21 @@ def compared(
     from sklearn.metrics import cohen_kappa_score
 
     words = [
-        {value: label_name(name, value, own) for value in np.unique(np.concatenate(side)).tolist() if value != UNKNOWN}
+        {
+            value: label_name(name, value, own)
+            for value in np.unique(np.concatenate(side)).tolist()
+            if value != UNKNOWN
+        }
         for side, own in zip(zip(*pairs, strict=True), known, strict=True)
     ]
     names = list(dict.fromkeys([*words[0].values(), *words[1].values()]))
     counts, boundaries, distances = np.zeros((len(names), len(names)), int), [0, 0], list[int]()
     for labels in pairs:
         said = (labels[0] != UNKNOWN) & (labels[1] != UNKNOWN)
-        both = [[names.index(of[value]) for value in own[said].tolist()] for own, of in zip(labels, words, strict=True)]
+        both = [
+            [names.index(of[value]) for value in own[said].tolist()]
+            for own, of in zip(labels, words, strict=True)
+        ]
         np.add.at(counts, tuple(np.array(both, int)), 1)
         inner = said[1:] & said[:-1]
         first, second = (np.flatnonzero((np.diff(own) != 0) & inner) + 1 for own in labels)

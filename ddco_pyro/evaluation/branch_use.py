@@ -25,12 +25,13 @@ SEED = 0
 def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[BranchUse]:
     """The use of branches in each level whose policies have branches, lowest first, the meta-policy last.
 
-    ``level`` is the number of the level from 0, ``branches`` has the names of the branches. Two tables have a row for
-    each option and a column for each branch, weighted by the posterior probability that the option is active:
+    ``level`` is the number of the level from 0, ``branches`` has the names of the branches. Two tables have a
+    row for each option and a column for each branch, weighted by the posterior probability that the option is
+    active:
 
     - ``activation``: the mean absolute value of the branch's output;
-    - ``loss``: the loss in nats per step, of the option's control or the meta-policy's choices, where the branch reads
-      the observation of a random other step; None where the level emits no control.
+    - ``loss``: the loss in nats per step, of the option's control or the meta-policy's choices, where the
+      branch reads the observation of a random other step; None where the level emits no control.
     """
     branched = _branched(hierarchy)
     sums: dict[int, Tensor] = {}
@@ -41,7 +42,9 @@ def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[BranchU
     found = []
     for level, network in branched.items():
         tables = (sums[level][..., :2] / sums[level][..., 2:]).permute(2, 0, 1).tolist()
-        activation, loss = ([[None if math.isnan(x) else x for x in row] for row in table] for table in tables)
+        activation, loss = (
+            [[None if math.isnan(x) else x for x in row] for row in table] for table in tables
+        )
         found.append(BranchUse(level=level, branches=list(network.names), activation=activation, loss=loss))
     return found
 
@@ -59,7 +62,8 @@ def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
 
 
 def _sums(piece: Inferred, level: int, branch: nn.Module) -> Tensor:
-    """Over the steps, of each caller of a level: activation and loss of a branch, weighted, and the weights, [K, 3].
+    """Over the steps, of each caller of a level: activation and loss of a branch, weighted, and the weights,
+    [K, 3].
 
     A weight is the posterior probability that the caller is active.
     """

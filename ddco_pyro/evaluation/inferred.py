@@ -37,10 +37,12 @@ DRAWS = 100
 def drawn(
     path: np.ndarray, starts: np.ndarray, options: np.ndarray, chosen: np.ndarray
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Each boundary of a path, and its steps in those draws from the posterior p(ζ | ξ) that have it, ascending.
+    """Each boundary of a path, and its steps in those draws from the posterior p(ζ | ξ) that have it,
+    ascending.
 
-    A boundary is a step at which option a ends and option b begins. A draw has the boundary where it has a step
-    with the same a and b between the two neighbouring boundaries of the path; its nearest such step counts.
+    A boundary is a step at which option a ends and option b begins. A draw has the boundary where it has a
+    step with the same a and b between the two neighbouring boundaries of the path; its nearest such step
+    counts.
 
     >>> path, starts = np.array([1, 1, 2, 2]), np.array([True, False, True, False])
     >>> options = np.array([[1, 1, 2, 2], [1, 2, 2, 2], [1, 1, 1, 1]])
@@ -56,7 +58,9 @@ def drawn(
     edges = [0, *(np.flatnonzero(starts[1:]) + 1).tolist(), steps]
     for before, step, after in zip(edges, edges[1:-1], edges[2:], strict=False):
         window = np.arange(before + 1, after)
-        here = (options[:, before : after - 1] == path[step - 1]) & (options[:, before + 1 : after] == path[step])
+        here = (options[:, before : after - 1] == path[step - 1]) & (
+            options[:, before + 1 : after] == path[step]
+        )
         here &= chosen[:, before + 1 : after]
         distance = np.where(here, np.abs(window - step), steps)
         yield step, np.sort(window[distance.argmin(1)][here.any(1)])
@@ -76,7 +80,8 @@ def within(at: np.ndarray, step: int, mass: float = 0.9) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class Inferred:
-    """The inference for N demonstrations, padded to the longest, T steps; each result is computed when first read.
+    """The inference for N demonstrations, padded to the longest, T steps; each result is computed when first
+    read.
 
     :param names: of the demonstrations.
     :param batch: the demonstrations, encoded for the networks.
@@ -140,31 +145,39 @@ class Inferred:
         steps = self.lengths[row]
         paths = ((choices[row, :steps].numpy().copy(), ends[row, :steps].numpy())
                  for choices, ends in zip(*self.path, strict=True))  # fmt: skip
-        return [(path, started(path, ends, own)) for (path, ends), own in zip(paths, self._lasts, strict=True)]
+        return [
+            (path, started(path, ends, own)) for (path, ends), own in zip(paths, self._lasts, strict=True)
+        ]
 
     def draws(self, row: int, number: int, seed: Sequence[int]) -> np.ndarray:
         """Choices and terminations of draws from p(ζ | ξ) for one demonstration, [2, D, number, T]."""
         length = self.lengths[row]
-        path = sample_paths(self.tables.part(torch.tensor([row]), length), torch.tensor([length]), number, seed)
+        path = sample_paths(
+            self.tables.part(torch.tensor([row]), length), torch.tensor([length]), number, seed
+        )
         return torch.stack([torch.stack(kind)[:, :, 0] for kind in path]).numpy()
 
     def drawn(self, row: int) -> list[dict[int, np.ndarray]]:
         """The boundaries of one demonstration, for each level: their steps in draws, by the step of the path."""
         found, draws = [], self.draws(row, DRAWS, (0, self.lengths[row]))
-        for lasting, (path, starts), options, ended in zip(self._lasts, self.segmented(row), *draws, strict=True):
+        for lasting, (path, starts), options, ended in zip(
+            self._lasts, self.segmented(row), *draws, strict=True
+        ):
             found.append(dict(drawn(path, starts, options, started(options, ended, lasting))))
         return found
 
     def intervals(self, row: int) -> list[np.ndarray]:
         """The 90 % interval of the first step of each segment of one demonstration, for each level, [segments, 2]."""
-        return [np.array([(0, 0), *(within(at, step) for step, at in level.items())]) for level in self.drawn(row)]
+        return [
+            np.array([(0, 0), *(within(at, step) for step, at in level.items())]) for level in self.drawn(row)
+        ]
 
 
 def started(options: np.ndarray, terminations: np.ndarray, lasts: bool) -> np.ndarray:
     """Whether a segment begins at each step of paths [..., T], true at the first step.
 
-    A segment begins with a new choice, which may be the same option. Where options end after every step (``lasts`` is
-    false), a segment begins where the option differs from the step before.
+    A segment begins with a new choice, which may be the same option. Where options end after every step
+    (``lasts`` is false), a segment begins where the option differs from the step before.
     """
     found: np.ndarray = terminations == 1 if lasts else np.diff(options, prepend=-1) != 0
     found[..., 0] = True
@@ -251,12 +264,14 @@ def infer(hierarchy: Hierarchy, demonstrations: Iterable[Demonstration]) -> Iter
     """Inference for demonstrations in order, as many together as the networks take at once.
 
     :param demonstrations: in memory, or an iterable that reads one after the other.
-    :raises DemonstrationsError: there are none, a shape is another than in the fit, or a number is too large for
-        networks.
+    :raises DemonstrationsError: there are none, a shape is another than in the fit, or a number is too large
+        for networks.
     """
     for group in _groups(_read(demonstrations, hierarchy), hierarchy.steps_at_once):
         demos = Demonstrations(tuple(group))
-        yield Inferred(demos.names, encode(demos, hierarchy.encoder, hierarchy.scaling, fitted=True), hierarchy)
+        yield Inferred(
+            demos.names, encode(demos, hierarchy.encoder, hierarchy.scaling, fitted=True), hierarchy
+        )
 
 
 def _read(demonstrations: Iterable[Demonstration], hierarchy: Hierarchy) -> Iterator[Demonstration]:
@@ -278,7 +293,9 @@ def _groups(demonstrations: Iterable[Demonstration], steps: int) -> Iterator[lis
     """Consecutive demonstrations with at most so many steps, padding included, and at least one demonstration."""
     group: list[Demonstration] = []
     for demo in demonstrations:
-        observed = sum(array[0].nbytes for array in demo.observations.values() if isinstance(array, np.ndarray))
+        observed = sum(
+            array[0].nbytes for array in demo.observations.values() if isinstance(array, np.ndarray)
+        )
         at_most = min(steps, GROUP_BYTES / (COPIES * observed + INFERENCE))
         if group and (len(group) + 1) * max(len(demo), *map(len, group)) > at_most:
             yield group

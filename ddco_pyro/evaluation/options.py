@@ -92,8 +92,8 @@ def option_use(posterior: Posterior, paths: Iterable[Sequence[np.ndarray]]) -> l
 TWITCH_SECONDS = 0.5
 TWITCH_STEPS = 5
 TWITCH_SHARE = 1 / 50
-"""A segment is a twitch where it is shorter: by the first where the rate is known, else by the others, of which the
-last is a share of its demonstration."""
+"""A segment is a twitch where it is shorter: by the first where the rate is known, else by the others, of
+which the last is a share of its demonstration."""
 
 
 def segments_of(paths: Sequence[np.ndarray], frequency: float | None = None) -> Segments:
@@ -107,14 +107,17 @@ def segments_of(paths: Sequence[np.ndarray], frequency: float | None = None) -> 
     shortest = (TWITCH_SECONDS * frequency if frequency else least for least in unknown)
     twitches = sum(int((own < least).sum()) for own, least in zip(each, shortest, strict=True))
     every = np.concatenate(each)
-    return Segments(median=float(np.median(every)), number=len(every), demonstrations=len(paths), twitches=twitches)
+    return Segments(
+        median=float(np.median(every)), number=len(every), demonstrations=len(paths), twitches=twitches
+    )
 
 
 def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]]:
     """The ``divergence`` of each pair of ``options`` of each level, lowest first, nats per step.
 
-    The divergence is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) + u_t(j);
-    None where neither option is ever active. Two options with divergence 0 are one skill under two numbers.
+    The divergence is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) +
+    u_t(j); None where neither option is ever active. Two options with divergence 0 are one skill under two
+    numbers.
 
     :param pieces: outputs of the networks and posteriors of demonstrations.
     """
@@ -123,7 +126,9 @@ def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]
         levels = levels or [0.0 for _ in posterior.u]
         for place, (own, u) in enumerate(zip(outputs.callers[:-1], posterior.u, strict=True)):
             own = own.map(Tensor.double)
-            levels[place] = levels[place] + torch.stack([_divergence(own, i, u) for i in range(u.shape[-1] - 1)])
+            levels[place] = levels[place] + torch.stack(
+                [_divergence(own, i, u) for i in range(u.shape[-1] - 1)]
+            )
     return [
         [
             Alike(options=(i + 1, j + 1), divergence=total / weight if weight > 0 else None)
@@ -203,8 +208,8 @@ class Finding:
     :param choice: the choice of the level.
     :param value: a share of the time, a duration in steps, or nats per step.
     :param other: the option that acts like a redundant one.
-    :param times: selections of an option that never persists, in each demonstration with the option; the number of
-        demonstrations that an option takes whole; the share of twitches of a brief level.
+    :param times: selections of an option that never persists, in each demonstration with the option; the
+        number of demonstrations that an option takes whole; the share of twitches of a brief level.
     """
 
     kind: Kind
@@ -293,7 +298,7 @@ SOUND = (
 """What was looked at where nothing is doubtful. A sign of two options that act alike is of used ones alone."""
 
 
-# --- signs in words ---------------------------------------------------------------------------------------------------
+# --- signs in words -----------------------------------------------------------------------------------------
 
 LISTED = 10
 """Options, or pairs of options, that a sign lists, the clearest first."""
@@ -321,7 +326,8 @@ def unlabelled_start(training: TrainingSpec) -> list[tuple[str, str]]:
 
 
 def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
-    """The findings of :func:`diagnose` in words, those of a kind and level as one sign, with the usual remedy.
+    """The findings of :func:`diagnose` in words, those of a kind and level as one sign, with the usual
+    remedy.
 
     Signs that labels show follow.
 
@@ -342,7 +348,8 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
 
 
 def beside_equal_parts(metrics: Metrics) -> list[tuple[str, bool]]:
-    """How options of each level with labels agree with them, and whether equal parts of each demonstration do better.
+    """How options of each level with labels agree with them, and whether equal parts of each demonstration do
+    better.
 
     On held-out demonstrations where there are any.
     """
@@ -357,7 +364,9 @@ def beside_equal_parts(metrics: Metrics) -> list[tuple[str, bool]]:
             numbers["accuracy"] = percent(own.matched_globally.accuracy)
             numbers["equal_accuracy"] = percent(other.matched_globally.accuracy)
             worse, part = own.nmi < other.nmi, "held out" if valid else "in training"
-            told.append((said("labels", "worse" if worse else "better", labels=labels, part=part, **numbers), worse))
+            told.append(
+                (said("labels", "worse" if worse else "better", labels=labels, part=part, **numbers), worse)
+            )
     return told
 
 
@@ -366,7 +375,9 @@ def _sign(findings: Sequence[Finding], level: str, names: Sequence[str], frequen
     kind, first, many = findings[0].kind, findings[0], len(findings)
     if kind == "high_fitting":
         share = first.amount(frequency)
-        return f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
+        return (
+            f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
+        )
     if kind == "brief":
         return (
             f"Options of level “{level}” switch every {first.amount(frequency)} (the median segment). "

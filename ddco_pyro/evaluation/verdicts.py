@@ -32,8 +32,8 @@ SMALLEST = 0.01
 """The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
 
 LOST = 1.0
-"""Nats per step and control dimension, from training to held-out demonstrations, from which on a model may have fallen
-apart: a control is e = 2.7 times less probable there."""
+"""Nats per step and control dimension, from training to held-out demonstrations, from which on a model may
+have fallen apart: a control is e = 2.7 times less probable there."""
 
 FEWEST = 3
 """Fewest held-out demonstrations of which an interval is told."""
@@ -45,39 +45,68 @@ OVER = {"one": "In this fit", "several": "Over {seeds} training seeds"}
 
 SENTENCES: Mapping[tuple[str, Direction], str] = {
     # options that last against the mixture
-    ("controls", "better"): "{over} options that last predict held-out controls better than the mixture does: {lead}.",
-    ("controls", "worse"): "{over} options that last predict held-out controls worse than the mixture does: {lead}.",
-    ("controls", "same"): "{over} options that last predict held-out controls as well as the mixture does: {lead}.",
-    ("controls", "unclear"): "{over} it is inconclusive whether options that last predict held-out controls better "
+    (
+        "controls",
+        "better",
+    ): "{over} options that last predict held-out controls better than the mixture does: {lead}.",
+    (
+        "controls",
+        "worse",
+    ): "{over} options that last predict held-out controls worse than the mixture does: {lead}.",
+    (
+        "controls",
+        "same",
+    ): "{over} options that last predict held-out controls as well as the mixture does: {lead}.",
+    (
+        "controls",
+        "unclear",
+    ): "{over} it is inconclusive whether options that last predict held-out controls better "
     "than the mixture does: {lead}.",
-    ("controls", "brief"): "{over} very short options predict held-out controls better than the mixture does: {lead}. "
+    (
+        "controls",
+        "brief",
+    ): "{over} very short options predict held-out controls better than the mixture does: {lead}. "
     "{brief}, and they are no skills.",
-    ("controls", "few"): "Too few demonstrations ({held_out}) are held out to compare options that last with the "
+    (
+        "controls",
+        "few",
+    ): "Too few demonstrations ({held_out}) are held out to compare options that last with the "
     "mixture: {lead}.",
     ("success", "better"): "{over} options succeed more often than the mixture: {lead}.",
     ("success", "worse"): "{over} options succeed less often than the mixture: {lead}.",
-    ("success", "unclear"): "{over} it is inconclusive whether options succeed more often than the mixture: {lead}.",
+    (
+        "success",
+        "unclear",
+    ): "{over} it is inconclusive whether options succeed more often than the mixture: {lead}.",
     ("success", "few"): "Success was not measured.",
     # a model against another one
     ("model", "better"): "{by} nats per step better than {other}",
     ("model", "worse"): "{by} nats per step worse than {other}",
     ("model", "unclear"): "with no clear difference from {other} ({lead} nats per step)",
     # options against labels and against equal parts of each demonstration
-    ("labels", "better"): "Options agree better with labels “{labels}” than equal parts of each demonstration "
+    (
+        "labels",
+        "better",
+    ): "Options agree better with labels “{labels}” than equal parts of each demonstration "
     "do: NMI {ours} against {equal}, accuracy {accuracy} against {equal_accuracy}, {part}.",
     ("labels", "worse"): "Equal parts of each demonstration agree better with labels “{labels}” than options "
     "do: NMI {equal} against {ours}, accuracy {equal_accuracy} against {accuracy}, {part}.",
     # doubts
-    ("held out", "worse"): "{name} fell apart on held-out demonstrations: {valid} nats per step there, {train} "
+    (
+        "held out",
+        "worse",
+    ): "{name} fell apart on held-out demonstrations: {valid} nats per step there, {train} "
     "in training. That is {loss} less for each of {controls} controls.",
     ("marginal", "worse"): "{name} {predict} held-out controls worse than the mean and the spread of each "
     "control do: {valid} against {marginal} nats per step.",
     ("flat", "worse"): "{name} {are} below {other} by {by} nats per step on held-out demonstrations.",
-    ("contained", "worse"): "In training {name} {are} less likely than the {other} that they contain, by {by} "
-    "nats per step.",
+    (
+        "contained",
+        "worse",
+    ): "In training {name} {are} less likely than the {other} that they contain, by {by} nats per step.",
 }
-"""Sentences by what was measured and in which direction; :data:`OVER` says over how many training seeds. {lead} is
-always options minus the mixture."""
+"""Sentences by what was measured and in which direction; :data:`OVER` says over how many training seeds.
+{lead} is always options minus the mixture."""
 
 ADVICE: Mapping[str, str] = {
     "held out": "Such a fit follows its training demonstrations too closely, and comparisons with it say nothing. Take "
@@ -117,7 +146,9 @@ class Models:
         rows = [row for row in metrics.demonstrations_by_likelihood if row.part == "valid"]
         steps = np.array([row.steps for row in rows], float)
         names = list(metrics.methods)
-        held_out = {name: np.array([row.log_likelihood_per_step[name] for row in rows]) * steps for name in names}
+        held_out = {
+            name: np.array([row.log_likelihood_per_step[name] for row in rows]) * steps for name in names
+        }
         train = {name: one.log_likelihood_per_step.train for name, one in metrics.methods.items()}
         return cls(held_out, train, steps, {name: name for name in names}, metrics.marginal)
 
@@ -141,7 +172,9 @@ class Models:
     def below_marginal(self, name: str) -> bool:
         """Whether a density without observations predicts the held-out controls better."""
         known = self.marginal
-        return known is not None and known.valid is not None and self.counts(known.valid - self.per_step(name))
+        return (
+            known is not None and known.valid is not None and self.counts(known.valid - self.per_step(name))
+        )
 
     def counts(self, nats: float) -> bool:
         """Whether a difference in nats per step is a doubt: more than :data:`SMALLEST` for each control dimension."""
@@ -150,8 +183,8 @@ class Models:
     def apart(self, name: str) -> bool:
         """Whether a model fell apart on held-out demonstrations.
 
-        It loses more than :data:`LOST` there, and is below the density without observations, or below every other model
-        by a 95 % interval. The likeliest of several models never fell apart.
+        It loses more than :data:`LOST` there, and is below the density without observations, or below every
+        other model by a 95 % interval. The likeliest of several models never fell apart.
         """
         others = [other for other in self.held_out if other != name]
         best = bool(others) and name == max(self.held_out, key=self.per_step)
@@ -182,14 +215,21 @@ class Models:
             yield said("held out", "worse", name=called, **values), ADVICE[advice]
         elif len(self.steps) and self.below_marginal(name) and self.marginal:
             values = {"valid": number(self.per_step(name)), "marginal": number(self.marginal.valid)}
-            text = said("marginal", "worse", name=called, predict=verb(called, "predict", "predicts"), **values)
+            text = said(
+                "marginal", "worse", name=called, predict=verb(called, "predict", "predicts"), **values
+            )
             yield text, ADVICE["marginal"]
-        flats = [other for other, kind in self.kinds.items() if kind in FLAT and self.kinds[name] == HIERARCHY]
+        flats = [
+            other for other, kind in self.kinds.items() if kind in FLAT and self.kinds[name] == HIERARCHY
+        ]
         if flats and len(self.steps):
             flat = max(flats, key=self.per_step)
             lead, other = self.lead(name, flat), method(flat) if self.kinds[flat] == flat else flat
             if self.direction(lead) == "worse":
-                by, are = f"{number(-lead.nats_per_step)} ± {number(lead.standard_error)}", verb(called, "are", "is")
+                by, are = (
+                    f"{number(-lead.nats_per_step)} ± {number(lead.standard_error)}",
+                    verb(called, "are", "is"),
+                )
                 text = said("flat", "worse", name=called, are=are, other=other, by=by)
                 yield text, ADVICE["flat"].format(other=other)
 
@@ -203,13 +243,17 @@ class Models:
         clauses, held_out = [], len(self.steps)
         for other, lead in leads.items():
             way = self.direction(lead)
-            by = number(abs(lead.nats_per_step)) + (f" ± {number(lead.standard_error)}" if way != "few" else "")
+            by = number(abs(lead.nats_per_step)) + (
+                f" ± {number(lead.standard_error)}" if way != "few" else ""
+            )
             sign: Direction = "better" if lead.nats_per_step > 0 else "worse"
             known: Direction = "unclear" if way in ("unclear", "same") else sign
             clauses.append(said("model", known, by=by, other=other, lead=with_error(lead)))
         text = f"{name} {verb(name, 'explain', 'explains')} held-out demonstrations {listed(clauses)}"
         if held_out < FEWEST:
-            held = "1 held-out demonstration is" if held_out == 1 else f"{held_out} held-out demonstrations are"
+            held = (
+                "1 held-out demonstration is" if held_out == 1 else f"{held_out} held-out demonstrations are"
+            )
             return f"{text} ({held} too few for an error; one fit of each model)."
         return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
 
@@ -237,7 +281,7 @@ def _direction(low: float, high: float, smallest: float = 0.0) -> Direction:
     return "better" if low > 0 else "worse" if high < 0 else "unclear"
 
 
-# --- what is doubtful -------------------------------------------------------------------------------------------------
+# --- what is doubtful ---------------------------------------------------------------------------------------
 
 
 def doubts(metrics: Metrics) -> list[tuple[str, str]]:
@@ -247,7 +291,12 @@ def doubts(metrics: Metrics) -> list[tuple[str, str]]:
     for name, one in metrics.below.items():
         if models.counts(gap := max(one.objective, one.nats)):
             text = said(
-                "contained", "worse", name=ours, are=verb(ours, "are", "is"), other=method(name), by=number(gap)
+                "contained",
+                "worse",
+                name=ours,
+                are=verb(ours, "are", "is"),
+                other=method(name),
+                by=number(gap),
             )
             found.append((text, ADVICE["contained"]))
     count = metrics.demonstrations.train
@@ -263,14 +312,16 @@ def faults(metrics: Metrics) -> list[tuple[str, str]]:
     return [found for name in metrics.comparison for found in models.doubts(name)]
 
 
-# --- the test against the mixture -------------------------------------------------------------------------------------
+# --- the test against the mixture ---------------------------------------------------------------------------
 
 
 def verdict(metrics: Metrics) -> str:
     """Everything that a run shows of its models, in sentences: doubts first, those about baselines last."""
     names = (method(name) for name, training in metrics.trainings.items() if not training.converged)
     first, last = ([" ".join(pair) for pair in pairs] for pairs in (doubts(metrics), faults(metrics)))
-    return f"{' '.join([*first, explained(metrics), tested(metrics), *last])}{rising(names)}".replace("  ", " ").strip()
+    return f"{' '.join([*first, explained(metrics), tested(metrics), *last])}{rising(names)}".replace(
+        "  ", " "
+    ).strip()
 
 
 def explained(metrics: Metrics) -> str:
@@ -298,7 +349,11 @@ def tested(metrics: Metrics) -> str:
     over = seeds.worth.get("memory") if seeds else None
     if not models.sound() or not (found or over):
         return ""
-    short = twitches(metrics.segments, metrics.control_frequency) if all(own.brief for own in metrics.segments) else ""
+    short = (
+        twitches(metrics.segments, metrics.control_frequency)
+        if all(own.brief for own in metrics.segments)
+        else ""
+    )
     if seeds and over:
         held_out = len(metrics.valid)
         errors = [error for error in seeds.standard_error["memory"] if error is not None]
@@ -314,7 +369,8 @@ def tested(metrics: Metrics) -> str:
 def _over_seeds(
     name: str, values: Sequence[float], error: float, trials: int, smallest: float = 0.0
 ) -> tuple[Direction, str]:
-    """The direction of a difference over training seeds, and its mean with the wider of two intervals, in words.
+    """The direction of a difference over training seeds, and its mean with the wider of two intervals, in
+    words.
 
     :param name: of :data:`~ddco_pyro.metrics.METRICS`.
     :param error: over so many trials, as in :func:`~ddco_pyro.statistics.wider_interval`.
@@ -333,7 +389,8 @@ def _lasting(way: Direction, lead: str, held_out: int, brief: str, seeds: int = 
 
 
 def twitches(segments: Sequence[Segments], frequency: float | None) -> str:
-    """How often the options of the lowest level switch, in a sentence, with the share of twitches where they do often.
+    """How often the options of the lowest level switch, in a sentence, with the share of twitches where they
+    do often.
 
     Empty without options.
     """
@@ -342,11 +399,15 @@ def twitches(segments: Sequence[Segments], frequency: float | None) -> str:
     own, least = segments[0], "0.5 s" if frequency else "5 steps or a fiftieth of their demonstration"
     each = number(own.number / own.demonstrations, 1)
     text = f"A demonstration has {each} segments of {duration(frequency, own.median)} (the median)"
-    share = f"; {percent(own.twitches / own.number)} of all are twitches, shorter than {least}" if own.often else ""
+    share = (
+        f"; {percent(own.twitches / own.number)} of all are twitches, shorter than {least}"
+        if own.often
+        else ""
+    )
     return f"{text}{share}."
 
 
-# --- success ----------------------------------------------------------------------------------------------------------
+# --- success ------------------------------------------------------------------------------------------------
 
 
 def success(metrics: Metrics) -> str:
@@ -376,7 +437,7 @@ def _succeeds(pair: Against, memory: Sequence[float]) -> str:
     return said("success", way, seeds=str(len(memory)), lead=points)
 
 
-# --- what training took -----------------------------------------------------------------------------------------------
+# --- what training took -------------------------------------------------------------------------------------
 
 
 def effort(training: Training) -> str:
@@ -396,11 +457,14 @@ def recogniser(training: Training) -> str:
     own = training.recogniser
     if own is None:
         return ""
-    return f"the controls count {own.power:g} times, the recogniser {own.weight:g} times (ridge {own.ridge:g})"
+    return (
+        f"the controls count {own.power:g} times, the recogniser {own.weight:g} times (ridge {own.ridge:g})"
+    )
 
 
 def contributions(training: Training) -> dict[str, tuple[float, float]]:
-    """What labels, recogniser and policies contribute: accuracy and edit score of left-out labelled demonstrations.
+    """What labels, recogniser and policies contribute: accuracy and edit score of left-out labelled
+    demonstrations.
 
     Means over ridges, by which the first row was chosen; empty without cross-validation.
     """
@@ -429,13 +493,15 @@ def spent(training: Training) -> str:
 
 
 def restarts(training: Training) -> str:
-    """Which of several restarts was kept: their starts and objectives, the ones stopped early or diverged, their
-    effort, and how their segments agree with those that were kept; empty for a single restart.
+    """Which of several restarts was kept: their starts and objectives, the ones stopped early or diverged,
+    their effort, and how their segments agree with those that were kept; empty for a single restart.
     """
     told = training.restarts
     if len(told.each) == 1:
         return ""
-    stopped = {number: restart.stopped for number, restart in enumerate(told.each) if restart.stopped is not None}
+    stopped = {
+        number: restart.stopped for number, restart in enumerate(told.each) if restart.stopped is not None
+    }
     early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped.items()) or "none"
     ended = ", ".join(str(number) for number, restart in enumerate(told.each) if restart.diverged)
     early += f"; diverged: {ended}" if ended else ""
@@ -448,7 +514,11 @@ def restarts(training: Training) -> str:
         f"restart {told.best} of {len(told.each)} was kept. Objectives in nats per step: {every}. Stopped early, with "
         f"their epochs of the last stage: {early}. Together they took {told.spent.epochs} epochs "
         f"({told.spent.gradient_steps} gradient steps)"
-        + (f". NMI of its segments of the training demonstrations with those of the others: {alike}" if alike else "")
+        + (
+            f". NMI of its segments of the training demonstrations with those of the others: {alike}"
+            if alike
+            else ""
+        )
     )
 
 
@@ -464,7 +534,11 @@ def unconverged(trainings: Mapping[str, Training]) -> list[tuple[str, str]]:
             up = f" (tuning log-likelihood up by {number(stage.rising)} nats per step over the last {stage.over})"
             if not stage.converged:
                 stages.append(f"stage {stage.stage} after {stage.epochs} epochs{up if stage.epochs else ''}")
-        first = f"Earlier stages of {who} had" if training.converged else f"{capital(who)} {verb(who, 'have', 'has')}"
+        first = (
+            f"Earlier stages of {who} had"
+            if training.converged
+            else f"{capital(who)} {verb(who, 'have', 'has')}"
+        )
         if stages:
             told.append((f"{first} not converged: the budget ended {listed(stages)}.", RAISE))
     return told

@@ -39,16 +39,17 @@ Exported = dict[str, tuple[float, float]]
 def export(fit: Fit, folder: str | Path, onnx: bool = False) -> Exported:
     """Write the controller that a run's ``rollout`` describes, and verify every form of it.
 
-    The folder gets ``controller.json``, ``weights.npz`` and ``runner.py``, which run with numpy alone; with ``onnx``
-    one step of all networks as ``controller.onnx``; and ``check.npz``, episodes to replay.
+    The folder gets ``controller.json``, ``weights.npz`` and ``runner.py``, which run with numpy alone; with
+    ``onnx`` one step of all networks as ``controller.onnx``; and ``check.npz``, episodes to replay.
 
-    Each form is loaded again from the disk and driven by ``runner.py`` through synthetic episodes. Every option must
-    equal the original's choice. Every control and network output must lie within
-    :func:`~ddco_pyro.exporting.recording.tolerance`. If all forms agree, the folder replaces an earlier export;
-    otherwise nothing changes.
+    Each form is loaded again from the disk and driven by ``runner.py`` through synthetic episodes. Every
+    option must equal the original's choice. Every control and network output must lie within
+    :func:`~ddco_pyro.exporting.recording.tolerance`. If all forms agree, the folder replaces an earlier
+    export; otherwise nothing changes.
 
     :raises Failed: a form acts differently, or cannot be made.
-    :raises BadInput: ``folder`` holds other files, or numpy cannot evaluate the networks and no ONNX is asked for.
+    :raises BadInput: ``folder`` holds other files, or numpy cannot evaluate the networks and no ONNX is asked
+        for.
 
     >>> [*ddco_pyro.export(fit, "controller")]  # it acts like the original
     ['numpy']
@@ -88,7 +89,9 @@ def write_numpy(fit: Fit, folder: Path) -> bool:
 
 def runner_source() -> str:
     """The runner as a file that stands by itself: with the functions of all kinds of control."""
-    functions = dict.fromkeys(chain.from_iterable((*emission.helpers, emission.control) for emission in KINDS.values()))
+    functions = dict.fromkeys(
+        chain.from_iterable((*emission.helpers, emission.control) for emission in KINDS.values())
+    )
     names = ", ".join(f'"{kind}": {control.__name__}' for kind, control in CONTROLS.items())
     sources = [*(getsource(function) for function in functions), f"CONTROLS = {{{names}}}\n"]
     library = "from ddco_pyro.model.emissions import CONTROLS\n\n"
@@ -100,7 +103,9 @@ def _write_verified(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
     """Write every file into an empty folder, and replay recorded episodes with each form that can run."""
     forms = [*(["numpy"] if write_numpy(fit, folder) else []), *(["onnx"] if onnx else [])]
     if not forms:
-        raise BadInput(f"{fit.place}: has networks that numpy cannot evaluate; export it with --out and --onnx")
+        raise BadInput(
+            f"{fit.place}: has networks that numpy cannot evaluate; export it with --out and --onnx"
+        )
     if onnx:
         (folder / "controller.onnx").write_bytes(_onnx(StepProgram(fit.hierarchy.eval()).eval()))
     episodes = record(fit.controller(), fit.hierarchy)
@@ -110,10 +115,14 @@ def _write_verified(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
     replayed = {}
     for form in forms:
         with _one_line_errors(f"as {form} it cannot be run"):
-            replayed[form] = runner.replay(runner.Runner(folder, form), runner.read_arrays(folder / "check.npz"))
+            replayed[form] = runner.replay(
+                runner.Runner(folder, form), runner.read_arrays(folder / "check.npz")
+            )
         difference = replayed[form][0]
         if not difference < allowed:
-            cause = "the weights are so large that float32 is too coarse for them" if allowed == MOST else DEFECT
+            cause = (
+                "the weights are so large that float32 is too coarse for them" if allowed == MOST else DEFECT
+            )
             what = f"as {form} it differs from the run by {difference:.1e}, of {allowed:.1e} that are allowed"
             raise Failed(f"nothing was written: {what}; {cause}")
     return replayed
@@ -125,7 +134,9 @@ def _one_line_errors(what: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise Failed(f"--onnx needs {error.name}; install it with: pip install 'ddco-pyro[export]'") from error
+        raise Failed(
+            f"--onnx needs {error.name}; install it with: pip install 'ddco-pyro[export]'"
+        ) from error
     except Exception as error:
         text = " ".join(str(error).split())[:300]
         raise Failed(f"nothing was written: {what}: {type(error).__name__}: {text}") from error
@@ -136,15 +147,19 @@ def _onnx(program: StepProgram) -> bytes:
     inputs, (given, names) = program.example(), program.onnx_names()
     with _one_line_errors("the networks cannot be exported"), warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # of torch about itself
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
+        logging.getLogger("torch.onnx").setLevel(
+            logging.ERROR
+        )  # it misses torchvision, which nothing here needs
         exported = torch.export.export(program, inputs)
-        made = torch.onnx.export(exported, inputs, input_names=given, output_names=names, dynamo=True, verbose=False)
+        made = torch.onnx.export(
+            exported, inputs, input_names=given, output_names=names, dynamo=True, verbose=False
+        )
         assert made is not None
         content: bytes = made.model_proto.SerializeToString()
     return content
 
 
-# --- LeRobot ----------------------------------------------------------------------------------------------------------
+# --- LeRobot ------------------------------------------------------------------------------------------------
 
 OWN = {"config.json", "policy_preprocessor.json", "policy_postprocessor.json"}
 
@@ -152,8 +167,9 @@ OWN = {"config.json", "policy_preprocessor.json", "policy_postprocessor.json"}
 def export_policy(fit: Fit, folder: Path) -> Exported:
     """Write the files of an export beside ``config.json`` and LeRobot's processors, which scale nothing.
 
-    An observation ``arm`` is ``observation.arm`` there. LeRobot reads the folder where ``lerobot_policy_ddco`` is
-    installed, which imports the folder's ``runner.py``: ``lerobot-eval --policy.path=FOLDER``.
+    An observation ``arm`` is ``observation.arm`` there. LeRobot reads the folder where
+    ``lerobot_policy_ddco`` is installed, which imports the folder's ``runner.py``: ``lerobot-eval
+    --policy.path=FOLDER``.
 
     :raises BadInput: numpy cannot evaluate the networks, or the folder holds other files.
     :raises Failed: the controller acts differently.
@@ -184,5 +200,7 @@ def export_policy(fit: Fit, folder: Path) -> Exported:
         device = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
         steps = {"policy_preprocessor": [rename, batch, device], "policy_postprocessor": [device]}
         for name, processors in steps.items():
-            write_text(temporary / f"{name}.json", json.dumps({"name": name, "steps": processors}, indent=2) + "\n")
+            write_text(
+                temporary / f"{name}.json", json.dumps({"name": name, "steps": processors}, indent=2) + "\n"
+            )
     return exported

@@ -21,8 +21,8 @@ from ddco_pyro.spec import STEP, ObservationSpec, RolloutSpec
 def named(outputs: Outputs) -> dict[str, Tensor]:
     """Network outputs by the names of the runner, each [N, T, ...].
 
-    ``selection_d``: log-probabilities [K, 1 + k]. ``control_d``: the numbers of the control [K, size]. Both belong to
-    the callers of level d, of which the last is the meta-policy. ``termination_d``: ψ [k].
+    ``selection_d``: log-probabilities [K, 1 + k]. ``control_d``: the numbers of the control [K, size]. Both
+    belong to the callers of level d, of which the last is the meta-policy. ``termination_d``: ψ [k].
     """
     tensors: dict[str, Tensor | None] = {
         f"termination_{d}": log[..., 1].double().exp() for d, log in enumerate(outputs.termination)
@@ -33,10 +33,11 @@ def named(outputs: Outputs) -> dict[str, Tensor]:
 
 
 class StepProgram(nn.Module):
-    """Maps features [F] (float64, not standardised), step [1], images [H, W, C] and the state to outputs and state.
+    """Maps features [F] (float64, not standardised), step [1], images [H, W, C] and the state to outputs and
+    state.
 
-    ``names`` are those of :func:`named`. The state holds tensors [1, ...] of each recurrent network, in the order of
-    :meth:`~ddco_pyro.model.hierarchy.Hierarchy.networks`.
+    ``names`` are those of :func:`named`. The state holds tensors [1, ...] of each recurrent network, in the
+    order of :meth:`~ddco_pyro.model.hierarchy.Hierarchy.networks`.
     """
 
     def __init__(self, hierarchy: Hierarchy) -> None:
@@ -47,12 +48,16 @@ class StepProgram(nn.Module):
             self.state = hierarchy.initial_states(1)
             self.names = list(self.outputs(*self.example())[0])
 
-    def outputs(self, features: Tensor, step: Tensor, *rest: Tensor) -> tuple[dict[str, Tensor], list[Tensor]]:
+    def outputs(
+        self, features: Tensor, step: Tensor, *rest: Tensor
+    ) -> tuple[dict[str, Tensor], list[Tensor]]:
         """The outputs by name, and the next state."""
         images, tensors = rest[: len(self.keys)], iter(rest[len(self.keys) :])
         states = {name: tuple(next(tensors) for _ in state) for name, state in self.state.items()}
         vectors = self.hierarchy.encoder.standardized(features.reshape(1, 1, -1))
-        pictures = {key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)}
+        pictures = {
+            key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)
+        }
         outputs, states = self.hierarchy.advance(Inputs(vectors, pictures, step), states)
         at_step = {name: values[0, 0] for name, values in named(outputs).items()}
         return at_step, [tensor for state in states.values() for tensor in state]
@@ -135,9 +140,9 @@ def describe(hierarchy: Hierarchy, control: RolloutSpec, program: StepProgram) -
 def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     """The description of one part of the control.
 
-    ``std`` has σ and other parameters of each level's callers, lowest first; callers that emit no control have none. A
-    σ that depends on the state is floor + softplus(y + start). For each such dimension ``per_state`` holds its place
-    in the part, the place of y among a caller's numbers, floor and start.
+    ``std`` has σ and other parameters of each level's callers, lowest first; callers that emit no control
+    have none. A σ that depends on the state is floor + softplus(y + start). For each such dimension
+    ``per_state`` holds its place in the part, the place of y among a caller's numbers, floor and start.
     """
     scaling = hierarchy.scaling
     part, places = scaling.parts[number], list(scaling.groups[number])
@@ -146,7 +151,8 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     own = slice(first, first + scaling.counts[number])
     each = zip(callers, (*(level.count for level in hierarchy.option_levels()), 1), strict=True)
     std = [
-        [] if one.std is None else one.std(torch.zeros(k, len(one.std.of_state)))[..., own].tolist() for one, k in each
+        [] if one.std is None else one.std(torch.zeros(k, len(one.std.of_state)))[..., own].tolist()
+        for one, k in each
     ]
     given = next(caller.std for caller in callers if caller.std is not None)  # all have the same kinds of σ
     per_state = [
@@ -173,8 +179,12 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
 def _networks(hierarchy: Hierarchy) -> dict[str, Any] | None:
     """The scaling of features, and the form of each network; None where one has none."""
     levels = hierarchy.option_levels()
-    networks = {f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.named_callers().values())}
-    networks |= {f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None}
+    networks = {
+        f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.named_callers().values())
+    }
+    networks |= {
+        f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None
+    }
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
     forms = {name: network.numpy_form() for name, network in networks.items()}
     encoder = hierarchy.encoder

@@ -26,15 +26,17 @@ FINEST = 48
 """Largest number of squares across the shorter side of a synthetic picture."""
 
 ROUNDINGS = 4
-"""Allowed difference in units of the original's own rounding error. The rounding error is the largest difference
-between float32 and float64 outputs, over an episode in one pass and step by step, which add in different orders."""
+"""Allowed difference in units of the original's own rounding error. The rounding error is the largest
+difference between float32 and float64 outputs, over an episode in one pass and step by step, which add in
+different orders."""
 
 MOST = 1e-4
 """Largest tolerance. Networks with a rounding error beyond a quarter of it are meaningless in float32."""
 
 
 def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray]:
-    """Synthetic episodes: observations as large as the training data's, actions, options, and network outputs.
+    """Synthetic episodes: observations as large as the training data's, actions, options, and network
+    outputs.
 
     ``seeds``, and for each episode ``observation_<episode>_<key>`` [T, ...], ``controls_<episode>`` [T, A],
     ``choices_<episode>`` [T, D], and the runner's outputs as ``<output>_<episode>`` [T, ...].
@@ -46,22 +48,26 @@ def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray
         seen = _episode(hierarchy.encoder, steps, random)
         controller.reset(episode)
         acted = [
-            (controller.act({key: obs[step] for key, obs in seen.items()}), controller.choices) for step in range(steps)
+            (controller.act({key: obs[step] for key, obs in seen.items()}), controller.choices)
+            for step in range(steps)
         ]
         arrays |= {f"observation_{episode}_{key}": obs for key, obs in seen.items()}
         arrays[f"controls_{episode}"] = np.stack([control for control, _ in acted])
-        arrays[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(steps, -1)
+        arrays[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(
+            steps, -1
+        )
         outputs = _at_once(hierarchy, hierarchy.encoder.inputs([seen]))
         arrays |= {f"{name}_{episode}": values for name, values in outputs.items()}
     return arrays
 
 
 def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float:
-    """Allowed difference of a form from the original, in the units of :func:`~ddco_pyro.exporting.runner.difference`.
+    """Allowed difference of a form from the original, in the units of
+    :func:`~ddco_pyro.exporting.runner.difference`.
 
-    The tolerance is :data:`ROUNDINGS` times the original's rounding error in these recorded episodes, clipped to
-    :data:`~ddco_pyro.exporting.runner.TOLERANCE` and :data:`MOST`. The lower end applies to a user's networks that
-    cannot be evaluated in float64.
+    The tolerance is :data:`ROUNDINGS` times the original's rounding error in these recorded episodes, clipped
+    to :data:`~ddco_pyro.exporting.runner.TOLERANCE` and :data:`MOST`. The lower end applies to a user's
+    networks that cannot be evaluated in float64.
     """
     exact, largest = copy.deepcopy(hierarchy).double(), 0.0
     for number in episodes["seeds"]:
@@ -73,7 +79,9 @@ def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float
             return runner.TOLERANCE
         recorded = {name: episodes[f"{name}_{number}"] for name in outputs}
         for rounded in (recorded, _stepwise(hierarchy, inputs)):
-            largest = max(largest, *(runner.difference({}, name, rounded[name], outputs[name]) for name in outputs))
+            largest = max(
+                largest, *(runner.difference({}, name, rounded[name], outputs[name]) for name in outputs)
+            )
     return float(np.clip(ROUNDINGS * largest, runner.TOLERANCE, MOST))
 
 
@@ -100,7 +108,8 @@ def _arrays(outputs: Outputs) -> runner.Outputs:
 
 
 def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
-    """Random observations with the mean and spread of the training data, and of its differences where they are used.
+    """Random observations with the mean and spread of the training data, and of its differences where they
+    are used.
 
     Angles are of a turn, and quaternions have norm 1.
     """

@@ -8,8 +8,8 @@
     controller.choices, controller.terminations   # active options, lowest level first, and their ψ
     controller.active                             # their names, by level
 
-``python runner.py [FOLDER] [numpy|onnx]`` replays the episodes in ``check.npz`` and prints the largest difference from
-the original. A user's networks may need ``Runner(".", networks="onnx")`` and onnxruntime.
+``python runner.py [FOLDER] [numpy|onnx]`` replays the episodes in ``check.npz`` and prints the largest
+difference from the original. A user's networks may need ``Runner(".", networks="onnx")`` and onnxruntime.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ import numpy as np
 from ddco_pyro.model.emissions import CONTROLS
 
 TOLERANCE = 1e-6
-"""Difference from the original that is always allowed. The unit of a control is the largest of 1, its spread, and its
-distance from its centre. ``check.npz`` holds this controller's tolerance, which grows with its rounding error."""
+"""Difference from the original that is always allowed. The unit of a control is the largest of 1, its spread,
+and its distance from its centre. ``check.npz`` holds this controller's tolerance, which grows with its
+rounding error."""
 
 
 ARRAY = "weights.npz"
 """The key, alone in its mapping, under which ``controller.json`` names an array."""
 
 Outputs = dict[str, np.ndarray]
-"""``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` the numbers of the control
-[K, size] (scaled means, logits of switches and of discrete actions, then y of every σ that depends on the state); d
-counts levels from 0, and the last d is the meta-policy."""
+"""``selection_d`` log-probabilities [K, 1 + k], ``termination_d`` ψ [k], ``control_d`` the numbers of the
+control [K, size] (scaled means, logits of switches and of discrete actions, then y of every σ that depends on
+the state); d counts levels from 0, and the last d is the meta-policy."""
 
 State = list[np.ndarray]
 """The states of recurrent networks, each [1, ...]."""
@@ -67,7 +68,9 @@ class Runner:
         self.outputs: Outputs = {}
         self._last: dict[str, np.ndarray] | None = None
         self._marginal: np.ndarray | None = None
-        self._state = [np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]]
+        self._state = [
+            np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]
+        ]
 
     @property
     def active(self) -> dict[str, str]:
@@ -100,7 +103,9 @@ class Runner:
     def _psi(self, outputs: Outputs) -> tuple[float, ...]:
         """ψ of each active choice, lowest level first; 1 for control."""
         active = enumerate(self.choices)
-        return tuple(float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0 for level, choice in active)
+        return tuple(
+            float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0 for level, choice in active
+        )
 
     def _features(self, now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -> np.ndarray:
         parts = [np.zeros(0)]
@@ -158,8 +163,14 @@ class Runner:
         level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
         numbers, first = outputs[f"control_{level}"][actor].astype(np.float64), 0
         sampled = self.about["control"] == "sample"
-        noise = generator.standard_normal(sum(len(part["places"]) for part in self.about["parts"])) if sampled else None
-        control = np.array(self.about["constant"])  # dimensions that never varied in the demonstrations stay so
+        noise = (
+            generator.standard_normal(sum(len(part["places"]) for part in self.about["parts"]))
+            if sampled
+            else None
+        )
+        control = np.array(
+            self.about["constant"]
+        )  # dimensions that never varied in the demonstrations stay so
         for part in self.about["parts"]:
             own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["places"]]
             control[part["dims"]] = CONTROLS[part["kind"]](part, own, _std(part, level, actor, numbers), z)
@@ -187,7 +198,11 @@ def _turned(seen: Mapping[str, np.ndarray], spec: Mapping[str, Any]) -> np.ndarr
 
     Sines and cosines of angles, and products of quaternions, are behind the rest.
     """
-    value, angles, quaternions = seen[spec["key"]].astype(np.float64).ravel(), spec["angles"], spec["quaternions"]
+    value, angles, quaternions = (
+        seen[spec["key"]].astype(np.float64).ravel(),
+        spec["angles"],
+        spec["quaternions"],
+    )
     if spec["minus"]:
         value = value - seen[spec["minus"]].astype(np.float64).ravel()
     four = [value[first : first + 4] for first in quaternions]
@@ -222,7 +237,9 @@ def _checked(observation: Mapping[str, Any], spec: Mapping[str, Any]) -> np.ndar
     if data.shape != shape:
         raise ValueError(f"observation {key!r} has shape {data.shape}, the demonstrations had {shape}")
     if data.dtype.kind not in "fiub" or (spec["image"] and data.dtype != np.uint8):
-        raise ValueError(f"observation {key!r} is {data.dtype}, it has to be {'uint8' if spec['image'] else 'numbers'}")
+        raise ValueError(
+            f"observation {key!r} is {data.dtype}, it has to be {'uint8' if spec['image'] else 'numbers'}"
+        )
     if not np.isfinite(data).all():
         raise ValueError(f"observation {key!r} is not finite")
     return data
@@ -235,7 +252,9 @@ def _read(folder: Path) -> dict[str, Any]:
     def placed(node: dict[str, Any]) -> Any:
         return weights[node[ARRAY]] if [*node] == [ARRAY] else node
 
-    about: dict[str, Any] = json.loads((folder / "controller.json").read_text(encoding="utf-8"), object_hook=placed)
+    about: dict[str, Any] = json.loads(
+        (folder / "controller.json").read_text(encoding="utf-8"), object_hook=placed
+    )
     return about
 
 
@@ -350,7 +369,9 @@ def _convolved(maps: np.ndarray, layer: Mapping[str, Any]) -> np.ndarray:
     weight, bias = layer["weight"], layer["bias"]
     size, pad, stride = weight.shape[-1], (layer["padding"],) * 2, layer["stride"]
     padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[
+        :, :, ::stride, ::stride
+    ]
     filters = weight.reshape(len(maps), -1, *weight.shape[1:])
     convolved = np.einsum("kchwij,kfcij->kfhw", windows, filters, optimize=True)
     return np.asarray(convolved + bias.reshape(len(maps), -1, 1, 1))
@@ -367,7 +388,9 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def _means(maps: np.ndarray) -> np.ndarray:
     """Means over 8 × 8 fields, [K, filters, 8, 8]."""
     rows, columns = (_fields(length, 8) for length in maps.shape[2:])
-    return np.stack([np.stack([maps[:, :, a:b, c:d].mean((2, 3)) for c, d in columns], -1) for a, b in rows], -2)
+    return np.stack(
+        [np.stack([maps[:, :, a:b, c:d].mean((2, 3)) for c, d in columns], -1) for a, b in rows], -2
+    )
 
 
 def _expected_places(maps: np.ndarray) -> np.ndarray:
@@ -411,7 +434,10 @@ def _onnx(folder: Path, about: Mapping[str, Any]) -> Networks:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
-    names, read = about["outputs"], [argument.name for argument in session.get_inputs()]  # nothing reads the others
+    names, read = (
+        about["outputs"],
+        [argument.name for argument in session.get_inputs()],
+    )  # nothing reads the others
 
     def evaluate(
         features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
@@ -431,9 +457,9 @@ FORMS: dict[str, Callable[[Path, Mapping[str, Any]], Networks]] = {"numpy": _num
 def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[float, float]:
     """Act on recorded observations again: the largest difference, and the median seconds of a step.
 
-    The control is compared with the original's; every caller's mean control and selection probabilities, and every
-    option's ψ, with what the original's networks say of the whole episode at once. The difference is infinite where
-    another option is active or a number is NaN.
+    The control is compared with the original's; every caller's mean control and selection probabilities, and
+    every option's ψ, with what the original's networks say of the whole episode at once. The difference is
+    infinite where another option is active or a number is NaN.
     """
     largest, seconds = 0.0, []
     for number, seed in enumerate(episodes["seeds"]):
@@ -447,7 +473,9 @@ def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[floa
             if list(controller.choices) != episodes[f"choices_{number}"][step].tolist():
                 largest = np.inf
             for name, value in {**controller.outputs, "controls": control}.items():
-                largest = max(largest, difference(controller.about, name, value, episodes[f"{name}_{number}"][step]))
+                largest = max(
+                    largest, difference(controller.about, name, value, episodes[f"{name}_{number}"][step])
+                )
     return largest, float(np.median(seconds))
 
 
@@ -479,7 +507,9 @@ def main() -> None:
     episodes = read_arrays(folder / "check.npz")
     largest, seconds = replay(Runner(folder, networks), episodes)
     allowed = float(episodes["tolerance"])
-    print(f"largest difference: {largest:.1e} of {allowed:.1e} that are allowed; a step takes {1e3 * seconds:.3f} ms")
+    print(
+        f"largest difference: {largest:.1e} of {allowed:.1e} that are allowed; a step takes {1e3 * seconds:.3f} ms"
+    )
     sys.exit(0 if largest < allowed else 1)
 
 

@@ -25,10 +25,12 @@ FORMAT = 5
 
 
 class Digest(Record):
-    """The digest of demonstrations: ``names`` in order, SHA-256 of controls, observations and labels, and ``masks``.
+    """The digest of demonstrations: ``names`` in order, SHA-256 of controls, observations and labels, and
+    ``masks``.
 
     :param format: the version of the run folder's format.
-    :param files: size, time of the last change (ns) and inode of the file with the pictures of an observation.
+    :param files: size, time of the last change (ns) and inode of the file with the pictures of an
+        observation.
     :param usual: what the demonstrations have in common; None where a folder lacks it.
     """
 
@@ -43,7 +45,11 @@ class Digest(Record):
 
     def places(self) -> dict[str, Any]:
         """The digests by place in a file of demonstrations."""
-        kinds: dict[str, Mapping[str, Any]] = {"obs": self.observations, "labels": self.labels, "mask": self.masks}
+        kinds: dict[str, Mapping[str, Any]] = {
+            "obs": self.observations,
+            "labels": self.labels,
+            "mask": self.masks,
+        }
         each = {f"{kind}/{key}": value for kind, values in kinds.items() for key, value in values.items()}
         return {"actions": self.controls} | each
 
@@ -56,7 +62,9 @@ def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
     """
     seen = {key: [demo.observations[key] for demo in demos] for key in sorted(demos[0].observations)}
     files = {key: found for key, arrays in seen.items() if (found := _file(arrays))}
-    unchanged = {key for key in files if known and (known.names, known.files.get(key)) == ([*demos.names], files[key])}
+    unchanged = {
+        key for key in files if known and (known.names, known.files.get(key)) == ([*demos.names], files[key])
+    }
     return Digest(
         names=[*demos.names],
         format=FORMAT,

@@ -21,7 +21,8 @@ class Boundary(NamedTuple):
     """A boundary of the most likely path, and where draws have it.
 
     :param step: the first step of the new segment.
-    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has the boundary.
+    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has the
+        boundary.
     :param probability: the share of draws that have the boundary.
     """
 
@@ -33,11 +34,14 @@ class Boundary(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Draws from p(ζ | ξ) of each demonstration, independent of each other, by forward filtering, backward sampling.
+    """Draws from p(ζ | ξ) of each demonstration, independent of each other, by forward filtering, backward
+    sampling.
 
-    :param options: choices by level, int8 [chain, draw, N, T]; −1 past a demonstration's end. A chain is a model: the
-        fit, then those of ``fit --seeds``, whose options are numbered like the fit's (:func:`matched`).
-    :param starts: whether an option is selected at a step, which may be the same as before, bool [chain, draw, N, T].
+    :param options: choices by level, int8 [chain, draw, N, T]; −1 past a demonstration's end. A chain is a
+        model: the fit, then those of ``fit --seeds``, whose options are numbered like the fit's
+        (:func:`matched`).
+    :param starts: whether an option is selected at a step, which may be the same as before, bool [chain,
+        draw, N, T].
     :param log_likelihood: log p(ξ), nats, [chain, N].
     :param demonstrations: their names.
     :param names: the names of the choices by level, control first.
@@ -52,7 +56,12 @@ class Draws:
     seeds: tuple[int, ...]
 
     def boundaries(
-        self, level: str, demonstration: int, path: np.ndarray, starts: np.ndarray | None = None, mass: float = 0.9
+        self,
+        level: str,
+        demonstration: int,
+        path: np.ndarray,
+        starts: np.ndarray | None = None,
+        mass: float = 0.9,
     ) -> list[Boundary]:
         """The boundaries of a path of one demonstration, with their intervals over all draws of all chains.
 
@@ -66,7 +75,8 @@ class Draws:
             raise BadInput(f"mass={mass!r}: has to be a number above 0, at most 1")
         steps = len(path) if (path >= 0).all() else int(np.argmax(path < 0))
         options, chosen = (
-            each[level][:, :, demonstration, :steps].reshape(-1, steps) for each in (self.options, self.starts)
+            each[level][:, :, demonstration, :steps].reshape(-1, steps)
+            for each in (self.options, self.starts)
         )
         if starts is None:
             starts, chosen = (np.diff(each[..., :steps], prepend=-1) != 0 for each in (path, options))
@@ -76,9 +86,9 @@ class Draws:
     def to_datatree(self) -> DataTree:
         """The draws as xarray's ``DataTree``, which ArviZ takes as inference data.
 
-        ``posterior`` has a variable for each level with the dimensions chain, draw, demonstration and step; int8, −1
-        past a demonstration's end. The coordinate ``<level>_name`` has the names of choices 0 to k. In
-        ``log_likelihood``, ``control`` is log p(ξ) in nats, by chain and demonstration.
+        ``posterior`` has a variable for each level with the dimensions chain, draw, demonstration and step;
+        int8, −1 past a demonstration's end. The coordinate ``<level>_name`` has the names of choices 0 to k.
+        In ``log_likelihood``, ``control`` is log p(ξ) in nats, by chain and demonstration.
 
         :raises BadInput: xarray is not installed.
         """
@@ -98,7 +108,10 @@ class Draws:
         known = {key: coordinates[key] for key in ("chain", "demonstration", "training_seed")}
         likelihood = {"control": (("chain", "demonstration"), self.log_likelihood, {"units": "nats"})}
         return xarray.DataTree.from_dict(
-            {"posterior": xarray.Dataset(variables, coordinates), "log_likelihood": xarray.Dataset(likelihood, known)}
+            {
+                "posterior": xarray.Dataset(variables, coordinates),
+                "log_likelihood": xarray.Dataset(likelihood, known),
+            }
         )
 
 
@@ -142,7 +155,8 @@ def draw(
 def _chain(
     model: Iterable[Inferred], draws: int, seed: tuple[int, int]
 ) -> tuple[list[str], np.ndarray, list[np.ndarray], list[torch.Tensor]]:
-    """The demonstrations and log p(ξ) under a model, with the draws [2, D, draw, T] of choices and terminations.
+    """The demonstrations and log p(ξ) under a model, with the draws [2, D, draw, T] of choices and
+    terminations.
 
     At last the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 + k_d)].
     """
@@ -158,13 +172,16 @@ def _chain(
     return names, np.concatenate(values), paths, active
 
 
-def matched(ours: Sequence[torch.Tensor], theirs: Sequence[torch.Tensor], sizes: Sequence[int]) -> list[np.ndarray]:
+def matched(
+    ours: Sequence[torch.Tensor], theirs: Sequence[torch.Tensor], sizes: Sequence[int]
+) -> list[np.ndarray]:
     """For each level, our number for each choice of another model.
 
-    Options are matched one to one, so that the expected number of steps in which both models have the matched options
-    is largest (Hungarian assignment). Choice 0 stays.
+    Options are matched one to one, so that the expected number of steps in which both models have the matched
+    options is largest (Hungarian assignment). Choice 0 stays.
 
-    :param ours: the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 + k_d)].
+    :param ours: the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 +
+        k_d)].
     :param sizes: 1 + k_d of each level.
     """
     together = torch.cat(list(ours)).T @ torch.cat(list(theirs))

@@ -38,13 +38,14 @@ SEEDS = 2**31 - 1
 class OptionSegmenter(BaseEstimator):
     """Options of observations X and controls U, as an estimator: one level, option h as label h − 1.
 
-    Sequences are a list of arrays, or one array of all steps with the ``lengths`` of the sequences; without ``lengths``
-    an array is one sequence. Arrays have a row for each step. Data frames and series of pandas and polars count as
-    arrays: their columns have to be named as in the fit, and an index is not read. ``score``, ``decode``, ``predict``
-    and ``predict_proba`` condition on all of a sequence.
+    Sequences are a list of arrays, or one array of all steps with the ``lengths`` of the sequences; without
+    ``lengths`` an array is one sequence. Arrays have a row for each step. Data frames and series of pandas
+    and polars count as arrays: their columns have to be named as in the fit, and an index is not read.
+    ``score``, ``decode``, ``predict`` and ``predict_proba`` condition on all of a sequence.
 
-    Without U, as in hmmlearn, X is emitted by the options, and there is no observation: a hidden Markov model with the
-    transition matrix diag(1 − ψ) + ψ ηᵀ, ``transmat_``. A one-dimensional second argument is hmmlearn's ``lengths``.
+    Without U, as in hmmlearn, X is emitted by the options, and there is no observation: a hidden Markov model
+    with the transition matrix diag(1 − ψ) + ψ ηᵀ, ``transmat_``. A one-dimensional second argument is
+    hmmlearn's ``lengths``.
 
     >>> X, U = [demo.observations["place"] for demo in demos], [demo.actions for demo in demos]
     >>> model = ddco_pyro.OptionSegmenter(2, random_state=0).fit(X, U)
@@ -60,7 +61,8 @@ class OptionSegmenter(BaseEstimator):
     :param random_state: the seed of the fit, a ``RandomState``, or None for another seed in each fit.
     :param settings: other settings by their key path in a spec, such as ``{"training.layerwise": False}``.
 
-    ``fit_`` is the :class:`~ddco_pyro.Fit`, ``spec_`` its spec, ``n_features_in_`` the number of columns of X.
+    ``fit_`` is the :class:`~ddco_pyro.Fit`, ``spec_`` its spec, ``n_features_in_`` the number of columns of
+    X.
     """
 
     def __init__(
@@ -92,7 +94,9 @@ class OptionSegmenter(BaseEstimator):
         self.fit_ = fit(self.spec_, demos)
         if not self._has_controls:
             (piece,) = self.fit_.infer(demos[:1])
-            selection, termination = (table[0].exp() for table in (piece.tables.selection, piece.tables.termination))
+            selection, termination = (
+                table[0].exp() for table in (piece.tables.selection, piece.tables.termination)
+            )
             self.startprob_ = selection[0, 0, 0, 1:].double().numpy()
             ending = termination[0, 0, :, 1:].double().numpy()
             self.transmat_ = np.diag(1 - ending[:, 0]) + ending * self.startprob_
@@ -103,7 +107,9 @@ class OptionSegmenter(BaseEstimator):
         demos = self._demonstrations(X, U, lengths)
         return np.concatenate(self.fit_.segment(demos)[0]) - 1
 
-    def predict_proba(self, X: Arrays, U: Arrays | None = None, lengths: Sequence[int] | None = None) -> np.ndarray:
+    def predict_proba(
+        self, X: Arrays, U: Arrays | None = None, lengths: Sequence[int] | None = None
+    ) -> np.ndarray:
         """The posterior probability of each option at each step, u of §4.1, [ΣT, k]."""
         demos = self._demonstrations(X, U, lengths)
         padded = self.fit_.posterior(demos).u[0].numpy()
@@ -133,7 +139,9 @@ class OptionSegmenter(BaseEstimator):
         check_is_fitted(self)
         if not self._has_controls:
             check_whole("X", X, 1)
-        observed = self._rows(X, None, lengths)[::2] if self._has_controls else (np.zeros((X, 1)), np.array([X]))
+        observed = (
+            self._rows(X, None, lengths)[::2] if self._has_controls else (np.zeros((X, 1)), np.array([X]))
+        )
         first = _drawn(random_state)
         controller = Controller(self.fit_.hierarchy, "sample", "sample")
         controls, options = [], []
@@ -157,7 +165,9 @@ class OptionSegmenter(BaseEstimator):
             "observations": [{"key": "x", "differences": self.differences and self._has_controls}],
             "control": {"kind": self.control, "std": {"learn": True, "per_option": True}},
             "hierarchy": {
-                "levels": [{"count": self.n_options, "policy": {"network": self.policy}, "termination": network}],
+                "levels": [
+                    {"count": self.n_options, "policy": {"network": self.policy}, "termination": network}
+                ],
                 "meta_policy": network,
             },
             "training": {
@@ -190,7 +200,9 @@ class OptionSegmenter(BaseEstimator):
         if controls is None:
             observed, controls = np.zeros((len(observed), 1)), observed
         pairs = zip(self._split(observed, steps), self._split(controls, steps), strict=True)
-        return Demonstrations(tuple(Demonstration(f"sequence_{n}", {"x": x}, u) for n, (x, u) in enumerate(pairs)))
+        return Demonstrations(
+            tuple(Demonstration(f"sequence_{n}", {"x": x}, u) for n, (x, u) in enumerate(pairs))
+        )
 
     def _rows(
         self, X: Any, U: Any, lengths: Any, fitting: bool = False
@@ -210,7 +222,9 @@ class OptionSegmenter(BaseEstimator):
                 lengths = [len(rows) for rows in X]
                 for number, rows in enumerate(X):  # the names and the number of columns
                     validate_data(self, rows, reset=fitting and number == 0, skip_check_array=True)
-                X = check_array(np.concatenate([np.asarray(rows) for rows in X]), dtype=np.float64, input_name="X")
+                X = check_array(
+                    np.concatenate([np.asarray(rows) for rows in X]), dtype=np.float64, input_name="X"
+                )
                 if U is not None:
                     controls = [np.asarray(rows) for rows in U]
                     if [len(rows) for rows in controls] != lengths:
@@ -219,7 +233,9 @@ class OptionSegmenter(BaseEstimator):
                         self._check_controls(rows, fitting and number == 0)
                     U = np.concatenate([rows[:, None] if rows.ndim == 1 else rows for rows in controls])
             else:
-                X = validate_data(self, X, reset=fitting, dtype=np.float64, ensure_min_samples=2 if fitting else 1)
+                X = validate_data(
+                    self, X, reset=fitting, dtype=np.float64, ensure_min_samples=2 if fitting else 1
+                )
                 self._check_controls(U, fitting)
             U = None if U is None else check_array(U, input_name="U")
         except BadInput:
@@ -239,7 +255,9 @@ class OptionSegmenter(BaseEstimator):
         if fitting:
             self._control_names = names
         elif names and self._control_names and names != self._control_names:
-            raise BadInput(f"U has the columns {', '.join(names)}; the fit had {', '.join(self._control_names)}")
+            raise BadInput(
+                f"U has the columns {', '.join(names)}; the fit had {', '.join(self._control_names)}"
+            )
 
     @staticmethod
     def _split(rows: np.ndarray, lengths: np.ndarray) -> list[np.ndarray]:

@@ -66,7 +66,8 @@ class _Part:
     :param dimensions: the parts of the same that each control dimension in the model has, [N, A'].
     :param options: and the part that the choice of options has, [N] (:func:`decompose`).
     :param segments: the most likely options [T] of each demonstration, for each level.
-    :param recognised: the options that a recogniser alone finds, [T] of each demonstration; empty without one.
+    :param recognised: the options that a recogniser alone finds, [T] of each demonstration; empty without
+        one.
     """
 
     values: np.ndarray
@@ -99,8 +100,8 @@ def decompose(outputs: Outputs, batch: Batch) -> tuple[Tensor, Tensor]:
 
         log p(ξ) = Σ_t log Σ_h p_t(h) π_h(a_t) = Σ_d Σ_t E_q_t[log π(a_td)] − Σ_t KL(q_t ‖ p_t).
 
-    :returns: Σ_t E_q_t[log π(a_td)] of the control dimensions in the model, [N, A'], and −Σ_t KL(q_t ‖ p_t), which is
-        at most 0, and 0 without options, [N].
+    :returns: Σ_t E_q_t[log π(a_td)] of the control dimensions in the model, [N, A'], and −Σ_t KL(q_t ‖ p_t),
+        which is at most 0, and 0 without options, [N].
     """
     exact, actions = outputs.map(lambda tensor: tensor.detach().double()), batch.actions.double()
     tables = exact.tables(actions)
@@ -120,7 +121,8 @@ def decompose(outputs: Outputs, batch: Batch) -> tuple[Tensor, Tensor]:
 
 
 def _as_own(fit: Fit, demos: Demonstrations) -> Callable[[Inferred], tuple[Tensor, ...]]:
-    """The most likely choices of a piece by the model without its demonstration, with the numbers of a fit's own.
+    """The most likely choices of a piece by the model without its demonstration, with the numbers of a fit's
+    own.
 
     Options are matched so that both models agree on as many steps of the other demonstrations as possible.
     """
@@ -167,7 +169,9 @@ def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
 
 
 def _versions() -> dict[str, str]:
-    installed = {package: next(iter(importlib.metadata.distributions(name=package)), None) for package in PACKAGES}
+    installed = {
+        package: next(iter(importlib.metadata.distributions(name=package)), None) for package in PACKAGES
+    }
     return {package: found.version for package, found in installed.items() if found}
 
 
@@ -181,8 +185,9 @@ def evaluate(
 ) -> Metrics:
     """The evaluation of a model.
 
-    It has the log-likelihood in nats per step of each part of the data and of each demonstration, and the paired
-    difference to every baseline. A hierarchy also has the use, divergences and agreement with labels of its options.
+    It has the log-likelihood in nats per step of each part of the data and of each demonstration, and the
+    paired difference to every baseline. A hierarchy also has the use, divergences and agreement with labels
+    of its options.
 
     :param parts: training (``train``) and held-out (``valid``) demonstrations.
     :param contained: names of the mixtures among the baselines that the model contains.
@@ -204,7 +209,9 @@ def evaluate(
     lengths = np.array([] if valid is None else valid.lengths, dtype=float)
     options, segments, alike = _options(fitted, demos) if depth else ([], [], [])
     labels, train = _trained_labels(fitted, parts["train"], ours["train"]), len(trained.data.train)
-    named = matched_names(fitted.spec, parts["train"], ours["train"].segments, labels) if depth and whole else []
+    named = (
+        matched_names(fitted.spec, parts["train"], ours["train"].segments, labels) if depth and whole else []
+    )
     counts = Counts(
         train=train,
         tune=len(parts["train"]) - train,
@@ -215,7 +222,9 @@ def evaluate(
     return Metrics(
         model=fitted.name,
         log_likelihood_per_step=Parts[Finite](train=per_step["train"], valid=per_step.get("valid")),
-        log_likelihood_by_dimension=Parts[Dimensions](train=by_dimension["train"], valid=by_dimension.get("valid")),
+        log_likelihood_by_dimension=Parts[Dimensions](
+            train=by_dimension["train"], valid=by_dimension.get("valid")
+        ),
         valid=[
             HeldOut(name=demo.name, steps=len(demo), log_likelihood=float(value))
             for demo, value in zip(valid or (), values.get("valid", ()), strict=True)
@@ -273,7 +282,8 @@ CONSTANT: Mapping[str, Any] = {
 
 
 def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Marginal | None:
-    """The density of the control without observations, of the same kinds, fitted to the demonstrations that train.
+    """The density of the control without observations, of the same kinds, fitted to the demonstrations that
+    train.
 
     :param parts: as of :func:`evaluate`.
     :returns: None where no demonstration is held out.
@@ -283,14 +293,20 @@ def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Ma
     own = {"control.std": spec.control.std} | {
         f"control.parts.{n}.std": p.std for n, p in enumerate(spec.control.parts)
     }
-    stds = {path: std if isinstance(std, LearnedStd) else LearnedStd(learn=True) for path, std in own.items() if std}
+    stds = {
+        path: std if isinstance(std, LearnedStd) else LearnedStd(learn=True)
+        for path, std in own.items()
+        if std
+    }
     learned = {path: {"learn": True, "floor": std.floor} for path, std in stds.items()}
     unseen = partial(_unseen, relative_to=spec.control.relative_to)
     train = unseen(tuning_split(spec, size, parts["train"])[0])
     alike = replace(size, shapes=train.observation_shapes, steps=max(train.lengths))  # of the same kinds
     model = train_model(with_overrides(spec, {**CONSTANT, **learned}), alike, train).hierarchy
     values = {
-        name: float(sum(piece.log_likelihood.sum() for piece in infer(model, unseen(part))) / sum(part.lengths))
+        name: float(
+            sum(piece.log_likelihood.sum() for piece in infer(model, unseen(part))) / sum(part.lengths)
+        )
         for name, part in parts.items()
     }
     return Marginal(**values, controls=len(model.scaling.varying))
@@ -299,7 +315,9 @@ def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Ma
 def _unseen(demos: Demonstrations, relative_to: str | None) -> Demonstrations:
     """Demonstrations with a constant in place of their observations, and with what options are of as their controls."""
     each = ((one, one.controls(relative_to)) for one in demos)
-    nothing = (replace(one, observations={"nothing": np.zeros((len(one), 1))}, actions=own) for one, own in each)
+    nothing = (
+        replace(one, observations={"nothing": np.zeros((len(one), 1))}, actions=own) for one, own in each
+    )
     return Demonstrations(tuple(nothing))
 
 
@@ -332,7 +350,9 @@ def _worst_first(
             name=demo.name,
             part=part,
             steps=len(demo),
-            log_likelihood_per_step={name: float(values[part][row]) / len(demo) for name, values in by_method.items()},
+            log_likelihood_per_step={
+                name: float(values[part][row]) / len(demo) for name, values in by_method.items()
+            },
         )
         for part, demos in parts.items()
         for row, demo in enumerate(demos)
@@ -341,7 +361,8 @@ def _worst_first(
 
 
 def _by_dimension(fit: Fit, part: _Part, demos: Demonstrations) -> Dimensions:
-    """The contributions of each control dimension, and of the choice of options, to the log-likelihood per step.
+    """The contributions of each control dimension, and of the choice of options, to the log-likelihood per
+    step.
 
     Constant dimensions, which the model leaves out, have None.
     """
@@ -364,7 +385,10 @@ def _agreement(fit: Fit, ours: Mapping[str, _Part], parts: Mapping[str, Demonstr
         truth, tasks = [[demo.labels[name] for demo in demos] for name in names], demos.tasks
         pairs = list(zip(ours[part].segments, truth, strict=False))
         equal = zip(truth, (level.count for level in levels), ours[part].segments, strict=False)
-        found |= {part: [agreement(*pair, tasks) for pair in pairs], "confusion": [confusion(*pair) for pair in pairs]}
+        found |= {
+            part: [agreement(*pair, tasks) for pair in pairs],
+            "confusion": [confusion(*pair) for pair in pairs],
+        }
         found[f"equal_{part}"] = [of_equal_lengths(*each, tasks) for each in equal]
         if names and recogniser is not None:
             found["recogniser"][part] = agreement(ours[part].recognised, truth[recogniser.level - 1], tasks)
@@ -374,8 +398,8 @@ def _agreement(fit: Fit, ours: Mapping[str, _Part], parts: Mapping[str, Demonstr
 def _trained_labels(fit: Fit, train: Demonstrations, ours: _Part) -> TrainedLabels | None:
     """The labels that a fit used in training (``training.labels``).
 
-    ``agreement`` is the fraction of the labelled steps whose most likely option, inferred without labels, is the
-    label's.
+    ``agreement`` is the fraction of the labelled steps whose most likely option, inferred without labels, is
+    the label's.
     """
     labels, own = used(fit.spec, fit.demonstrations), fit.spec.training.labels
     if labels is None or own is None:

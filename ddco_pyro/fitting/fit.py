@@ -64,24 +64,30 @@ def fit(
     >>> ddco_pyro.fit("mine.yaml", demos, out="runs/mine").folder.as_posix()
     'runs/mine'
 
-    :param spec: a spec, or its YAML file; one that names user code is given by ``load_spec(path, allow_code=True)``.
-    :param demonstrations: in memory, in any order, or the HDF5 file to use instead of ``demonstrations.path``; None for
-        those that the spec names.
-    :param out: the run folder, as ``ddco-pyro fit`` makes it, with a copy of demonstrations from memory; None to write
-        nothing. An unfinished run is continued; a finished one is loaded.
-    :param on_event: called with progress events (:mod:`ddco_pyro.events`), such as :class:`ddco_pyro.Progress`.
-    :param jobs: processes that train side by side: restarts, or the model, its baselines and the models without each
-        demonstration. -1 is one on each core, 1 this process alone. The result is the same for any number. In a script,
-        more than one needs the usual ``if __name__ == "__main__":``.
+    :param spec: a spec, or its YAML file; one that names user code is given by ``load_spec(path,
+        allow_code=True)``.
+    :param demonstrations: in memory, in any order, or the HDF5 file to use instead of
+        ``demonstrations.path``; None for those that the spec names.
+    :param out: the run folder, as ``ddco-pyro fit`` makes it, with a copy of demonstrations from memory; None
+        to write nothing. An unfinished run is continued; a finished one is loaded.
+    :param on_event: called with progress events (:mod:`ddco_pyro.events`), such as
+        :class:`ddco_pyro.Progress`.
+    :param jobs: processes that train side by side: restarts, or the model, its baselines and the models
+        without each demonstration. -1 is one on each core, 1 this process alone. The result is the same for
+        any number. In a script, more than one needs the usual ``if __name__ == "__main__":``.
     :param resume: whether ``out`` may hold the finished run.
-    :param keep: whether ``out`` has a copy of demonstrations from memory; False where the spec's file has them.
-    :raises BadInput: there is no such number of jobs, ``torchrun`` started too many processes, or the folder holds
-        something else, such as a run of other demonstrations.
+    :param keep: whether ``out`` has a copy of demonstrations from memory; False where the spec's file has
+        them.
+    :raises BadInput: there is no such number of jobs, ``torchrun`` started too many processes, or the folder
+        holds something else, such as a run of other demonstrations.
     :raises SpecError: something in the spec does not fit the demonstrations.
     :raises DemonstrationsError: the demonstrations cannot be used.
     :raises TrainingError: training stopped; the checkpoints stay.
     """
-    spec, folder = spec if isinstance(spec, Spec) else load_spec(spec), None if out is None else path_of(out, "out")
+    spec, folder = (
+        spec if isinstance(spec, Spec) else load_spec(spec),
+        None if out is None else path_of(out, "out"),
+    )
     processes, shards = Ranks.here().size, spec.training.shards
     if processes > shards:
         raise BadInput(
@@ -94,14 +100,18 @@ def fit(
         if isinstance(demonstrations, Iterable) and not isinstance(demonstrations, str | Demonstrations):
             demonstrations = Demonstrations(tuple(demonstrations))
         if isinstance(demonstrations, Demonstrations):
-            ordered = demonstrations.select(sorted(demonstrations.names, key=natural))  # as they are read back
+            ordered = demonstrations.select(
+                sorted(demonstrations.names, key=natural)
+            )  # as they are read back
             given = replace(ordered, masks=demonstrations.masks)
             if keep and folder is not None:
                 spec = with_overrides(spec, {"demonstrations.path": str(folder / "demonstrations.hdf5")})
             demos: Demonstrations | None = seen(spec, given)
         else:
             if demonstrations is not None:
-                spec = with_overrides(spec, {"demonstrations.path": str(path_of(demonstrations, "demonstrations"))})
+                spec = with_overrides(
+                    spec, {"demonstrations.path": str(path_of(demonstrations, "demonstrations"))}
+                )
             demos = known_demonstrations(spec)
         models = check_models(spec, dimensions_for(spec, demos))
         for its, _ in models.values():
@@ -149,7 +159,9 @@ def _fit_models(
     spec, *_ = next(iter(models.values()))
     specs = {other: its for other, (its, _) in list(models.items())[1:]}
     split, size = train_and_valid(spec, demos), dimensions_for(spec, demos)
-    labels = {other: its.training.labels for other, its in specs.items()}  # the model chooses the recogniser of all
+    labels = {
+        other: its.training.labels for other, its in specs.items()
+    }  # the model chooses the recogniser of all
     later = {other for other, own in labels.items() if own and own.recogniser == "cross_validated"}
 
     def baseline(other: str) -> Callable[..., Fit]:
@@ -158,15 +170,22 @@ def _fit_models(
 
     # several long restarts share the processes among themselves
     short = len(spec.training.starts) == 1 or all(_over_all(*model) for model in models.values())
-    beside = [other for other in specs if short and other not in later and _worth_a_process(*models[other], demos)]
+    beside = [
+        other for other in specs if short and other not in later and _worth_a_process(*models[other], demos)
+    ]
     if beside:
         compile_all()
-    calls, waiting = {other: baseline(other) for other in beside}, {o: training_began(specs[o], o) for o in beside}
+    calls, waiting = (
+        {other: baseline(other) for other in beside},
+        {o: training_began(specs[o], o) for o in beside},
+    )
     with run_all(calls, workers, "trained a baseline", on_event, True, True, waiting) as fitted_beside:
         with clock("training"):
             free, checkpoints = max(1, workers.number() - len(beside)), folder and folder / "checkpoints"
             prior, held_out = prior_of(spec, Workers(free)), split.get("valid")
-            trained = train_model(spec, size, split["train"], on_event, checkpoints, held_out, name, free, prior)
+            trained = train_model(
+                spec, size, split["train"], on_event, checkpoints, held_out, name, free, prior
+            )
         specs |= {other: _with_recogniser(specs[other], trained.summary["recogniser"]) for other in later}
         with clock("baselines"):
             here = {other: baseline(other)(on_event, workers) for other in specs if other not in beside}
@@ -178,7 +197,9 @@ def _fit_models(
             trained.contain(by_name[other].hierarchy, by_name[other].metrics.training.objective)
         hierarchy = trained.hierarchy
         if folder:
-            write_table(folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), trained.history)
+            write_table(
+                folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), trained.history
+            )
             write_model(folder, hierarchy)
         alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
         apart = _without_each(spec, demos, folder, on_event, alone)
@@ -209,7 +230,9 @@ def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
     :param chosen: of :class:`~ddco_pyro.metrics.Recogniser`.
     """
     recogniser = {"weight": chosen["weight"], "ridge": chosen["ridge"]}
-    return with_overrides(baseline, {"control.power": chosen["power"], "training.labels.recogniser": recogniser})
+    return with_overrides(
+        baseline, {"control.power": chosen["power"], "training.labels.recogniser": recogniser}
+    )
 
 
 def _without_each(
@@ -223,7 +246,9 @@ def _without_each(
     calls = {}
     for name in demos.names:
         others = replace(demos, masks={"valid": (name,)})
-        calls[name] = partial(fit_beside, f"{model_name(spec)} without {name}", alone, others, places.get(name))
+        calls[name] = partial(
+            fit_beside, f"{model_name(spec)} without {name}", alone, others, places.get(name)
+        )
     with run_all(calls, workers, "trained without a demonstration", on_event) as trained:
         fits = dict(trained)
     return {name: fits[name].hierarchy for name in demos.names}
@@ -242,7 +267,8 @@ def fit_beside(
     It is without demonstrations, which another process need not send back.
 
     :param name: of the model in events.
-    :param folder: two below the folder of the run or selection, which has a digest of the same demonstrations.
+    :param folder: two below the folder of the run or selection, which has a digest of the same
+        demonstrations.
     """
     if folder:
         claim(folder, spec)
@@ -253,7 +279,7 @@ def fit_beside(
     return replace(_fit_models(models, demos, folder, on_event, workers, name=name), given=None)
 
 
-# --- other training seeds ---------------------------------------------------------------------------------------------
+# --- other training seeds -----------------------------------------------------------------------------------
 
 
 def training_seeds(spec: Spec, seeds: int) -> list[int]:
@@ -273,7 +299,8 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
 
     Each repetition is a run in ``seeds/SEED`` of the run folder; a finished one is not done again.
 
-    :param jobs: processes that fit side by side; -1 is one for each core. The result is the same for any number.
+    :param jobs: processes that fit side by side; -1 is one for each core. The result is the same for any
+        number.
     :returns: the fit, with the results of all repetitions in ``metrics.seeds`` and ``metrics.json``.
     :raises Failed: a process died.
     """
@@ -290,10 +317,17 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
         models = {first.metrics.model: each} | {
             name: [metrics.comparison[name] for metrics in each] for name in first.metrics.comparison
         }
-        held_out = {name: [one.log_likelihood_per_step.valid for one in them] for name, them in models.items()}
+        held_out = {
+            name: [one.log_likelihood_per_step.valid for one in them] for name, them in models.items()
+        }
         nats = {part: [parts[part].nats_per_step for parts in worth] for part in worth[0]}
         errors = {part: [parts[part].standard_error for parts in worth] for part in worth[0]}
-        about = {"training_seeds": [own, *others], "held_out": held_out, "worth": nats, "standard_error": errors}
+        about = {
+            "training_seeds": [own, *others],
+            "held_out": held_out,
+            "worth": nats,
+            "standard_error": errors,
+        }
         first.metrics.seeds = Seeds.model_validate(about)
         first.metrics.write(folder)
     return first
@@ -303,7 +337,7 @@ def _again(spec: Spec, seed: int, folder: Path) -> Metrics:
     return fit(with_overrides(spec, {"training.seed": seed}), None, folder).metrics
 
 
-# --- in other processes -----------------------------------------------------------------------------------------------
+# --- in other processes -------------------------------------------------------------------------------------
 
 LONG = 1000
 """Gradient steps, at least, of a training that takes longer than starting a process."""

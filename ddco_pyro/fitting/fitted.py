@@ -45,8 +45,8 @@ class Fit:
     :param folder: the run folder; None where nothing was written.
     :param given: the demonstrations of the fit; None for those that the spec names.
     :param beside: the fitted baselines, by name; None for those in the run folder.
-    :param apart: models that were trained without a demonstration, by its name (``demonstrations.hold_out_by``); None
-        for those in the run folder.
+    :param apart: models that were trained without a demonstration, by its name
+        (``demonstrations.hold_out_by``); None for those in the run folder.
     :param named: the names of the options of each level that has names; :meth:`name_options` changes them.
     """
 
@@ -70,7 +70,11 @@ class Fit:
         if self.metrics is not None:
             counts, values = self.metrics.demonstrations, self.metrics.log_likelihood_per_step
             each = {"trained with": (counts.train, values.train), "held out": (counts.valid, values.valid)}
-            known = [f"{value:.3f} ({number} {part})" for part, (number, value) in each.items() if value is not None]
+            known = [
+                f"{value:.3f} ({number} {part})"
+                for part, (number, value) in each.items()
+                if value is not None
+            ]
             lines.append(f"log-likelihood, nats per step: {', '.join(known)}")
         return "\n  ".join(lines)
 
@@ -130,20 +134,20 @@ class Fit:
             return None
         return (kept and kept.usual) or usual_of(self.demonstrations)
 
-    def unlike(self, known: Sequence[Traits], nats: Mapping[str, float], frequency: float | None) -> list[str]:
+    def unlike(
+        self, known: Sequence[Traits], nats: Mapping[str, float], frequency: float | None
+    ) -> list[str]:
         """A line for each reason why demonstrations are unlike those of the fit.
 
-        :param nats: log p(ξ) per step of each, by name. It is unusual if it lies below that of the fit's by their whole
-            range, and a nat for each control dimension: a control one σ farther off costs that.
+        :param nats: log p(ξ) per step of each, by name. It is unusual if it lies below that of the fit's by
+            their whole range, and a nat for each control dimension: a control one σ farther off costs that.
         :param frequency: control steps per second, Hz; None if unknown.
         """
         reasons = {} if self.usual is None else unlike(known, self.usual, frequency)
         fitted = [row.log_likelihood_per_step[self.name] for row in self.metrics.demonstrations_by_likelihood]
         low, high = min(fitted), max(fitted)
         less = [name for name in nats if nats[name] < 2 * low - high - self.hierarchy.scaling.size]
-        why = (
-            f"{np.median([nats[name] for name in less] or [0]):.1f} nats a step, and {low:.1f} to {high:.1f} in the fit"
-        )
+        why = f"{np.median([nats[name] for name in less] or [0]):.1f} nats a step, and {low:.1f} to {high:.1f} in the fit"
         return reasons_told(dict.fromkeys(less, why) | reasons, len(nats))
 
     @cached_property
@@ -197,26 +201,32 @@ class Fit:
 
     def was_held_out(self, name: str, log_likelihood: float) -> bool:
         """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
-        return bool(np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
+        return bool(
+            np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE)
+        )
 
     def infer(self, demos: Iterable[Demonstration], held_out: bool = False) -> Iterator[Inferred]:
-        """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in order.
+        """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in
+        order.
 
         >>> for piece in fit.infer(demos):
         ...     print(piece.log_likelihood.shape, piece.posterior.u[0].shape, piece.path.choices[0].shape)
         (6,) torch.Size([6, 10, 3]) torch.Size([6, 10])
 
         :param demos: :class:`~ddco_pyro.Demonstrations`, or an iterable that reads one after the other.
-        :param held_out: with ``demonstrations.hold_out_by: demonstration``, each by the model trained without it.
-        :raises DemonstrationsError: there are none, an observation or the control has another shape than in the fit, or
-            a number is too large for networks.
+        :param held_out: with ``demonstrations.hold_out_by: demonstration``, each by the model trained without
+            it.
+        :raises DemonstrationsError: there are none, an observation or the control has another shape than in
+            the fit, or a number is too large for networks.
         """
         if not (held_out and self.without):
             yield from infer(self.hierarchy, demos)
         else:
             for demo in demos:
                 if demo.name not in self.without:
-                    raise BadInput(f"{demo.name}: no model was trained without it; {unknown(demo.name, self.without)}")
+                    raise BadInput(
+                        f"{demo.name}: no model was trained without it; {unknown(demo.name, self.without)}"
+                    )
                 yield from infer(self.without[demo.name], [demo])
 
     def log_likelihood(self, demos: Iterable[Demonstration]) -> np.ndarray:
@@ -235,7 +245,9 @@ class Fit:
         (torch.Size([6, 10, 3]), 1.0)
         """
         parts = [piece.posterior for piece in self.infer(demos)]
-        return Posterior(*(tuple(map(_stacked, zip(*kind, strict=True))) for kind in zip(*parts, strict=True)))
+        return Posterior(
+            *(tuple(map(_stacked, zip(*kind, strict=True))) for kind in zip(*parts, strict=True))
+        )
 
     def refuse_flat(self) -> None:
         """Refuse a policy without options.
@@ -243,7 +255,9 @@ class Fit:
         :raises BadInput: this is one.
         """
         if self.spec.hierarchy is None:
-            raise BadInput(f"{self.place}: is a {self.name} policy without options; name a run that has options")
+            raise BadInput(
+                f"{self.place}: is a {self.name} policy without options; name a run that has options"
+            )
 
     def segment(self, demos: Iterable[Demonstration]) -> tuple[Segmentation, ...]:
         """Choices of the most likely path, for each level, lowest first: of each demonstration an array [T].
@@ -289,7 +303,9 @@ class Fit:
 
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
-        return Controller(self.hierarchy, self.spec.rollout.control, self.spec.rollout.options, seed, self.names)
+        return Controller(
+            self.hierarchy, self.spec.rollout.control, self.spec.rollout.options, seed, self.names
+        )
 
     def monitor(self) -> Monitor:
         """A live monitor of the active options while another policy, or a person, acts."""
@@ -313,25 +329,32 @@ def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] 
     >>> again.metrics == fit.metrics, (again.log_likelihood(demos) == fit.log_likelihood(demos)).all()
     (True, np.True_)
 
-    :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is ever
-        executed.
+    :param allow_code: import the user code (``module:name``) that its spec names; nothing else in a run is
+        ever executed.
     :param overrides: other settings of the report, such as ``"report.trajectory=pose"``.
-    :raises BadInput: the folder has no finished fit, or one of another format; or the model, or ``names.yaml``, is of
-        another spec.
+    :raises BadInput: the folder has no finished fit, or one of another format; or the model, or
+        ``names.yaml``, is of another spec.
     :raises Damaged: the model or ``metrics.json`` is damaged.
-    :raises SpecError: its spec names user code, and that is not allowed; or an override is no setting of the report.
+    :raises SpecError: its spec names user code, and that is not allowed; or an override is no setting of the
+        report.
     """
     folder = path_of(folder, "folder")
-    missing = [name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()]
+    missing = [
+        name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()
+    ]
     if missing:
-        what = "not a run folder" if "spec.yaml" in missing else "an unfinished run: fit it again to continue it"
+        what = (
+            "not a run folder" if "spec.yaml" in missing else "an unfinished run: fit it again to continue it"
+        )
         if (folder / "folds.json").exists():
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise BadInput(f"{folder}: {what} (it has no {missing[0]})")
     recorded(folder)  # or the format is another, and so are the keys of the spec
     fitted, spec = (load_spec(folder / "spec.yaml", those, allow_code) for those in ((), overrides))
     if spec.model_copy(update={"report": fitted.report}) != fitted:
-        raise SpecError(f"{folder}: is fitted; only settings of the report can change, such as report.trajectory=KEY")
+        raise SpecError(
+            f"{folder}: is fitted; only settings of the report can change, such as report.trajectory=KEY"
+        )
     hierarchy = read_model(folder, spec)
     metrics = Metrics.read(folder, [level.count for level in spec.levels])
     return Fit(spec, hierarchy, metrics, folder, named=read_names(folder, spec) or {})

@@ -52,7 +52,9 @@ def library_of(spec: Spec) -> Fit | None:
     for one in models:
         if _model(one.spec) == _model(spec):
             return one
-    nearest = min(models, key=lambda one: sum(_model(one.spec)[key] != own for key, own in _model(spec).items()))
+    nearest = min(
+        models, key=lambda one: sum(_model(one.spec)[key] != own for key, own in _model(spec).items())
+    )
     differing = next(key for key, own in _model(spec).items() if _model(nearest.spec)[key] != own)
     raise SpecError(
         f"training.library.run: {given.run} has no model with this {differing}; take observations, control and "
@@ -80,7 +82,12 @@ def check_library(spec: Spec) -> None:
     :raises BadInput: it is not, or it cannot.
     """
     given, library = spec.training.library, library_of(spec)
-    if given is not None and library is not None and given.ridge is None and not (library.run_folder / STORED).exists():
+    if (
+        given is not None
+        and library is not None
+        and given.ridge is None
+        and not (library.run_folder / STORED).exists()
+    ):
         _several_tasks(library)
 
 
@@ -97,7 +104,8 @@ def prior_of(spec: Spec, workers: Workers = Workers(1)) -> Prior | None:  # noqa
 
 
 def for_new_task(path: Path, run: Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
-    """The spec of a library's run with what a file says of a new task, which trains on all demonstrations there are.
+    """The spec of a library's run with what a file says of a new task, which trains on all demonstrations
+    there are.
 
     :raises SpecError: the file or the run's spec cannot be read, or together they are no valid spec.
     """
@@ -106,7 +114,11 @@ def for_new_task(path: Path, run: Path, overrides: Iterable[str] = (), allow_cod
         "demonstrations": {"valid_fraction": 0, "hold_out_by": None, "exclude": [], "where": {}},
         "training": {"tune_fraction": 0, "library": {"run": str(run)}},
     }
-    said = [f"{key}={dump_yaml(value)}" for part in (alone, read_mapping(path, "spec")) for key, value in _leaves(part)]
+    said = [
+        f"{key}={dump_yaml(value)}"
+        for part in (alone, read_mapping(path, "spec"))
+        for key, value in _leaves(part)
+    ]
     return load_spec(run / "spec.yaml", [*said, *overrides], allow_code)
 
 
@@ -119,15 +131,17 @@ def _leaves(data: Mapping[str, Any], place: str = "") -> Iterable[tuple[str, Any
             yield f"{place}{key}", value
 
 
-# --- the strength that the library's tasks choose ---------------------------------------------------------------------
+# --- the strength that the library's tasks choose -----------------------------------------------------------
 
 
 def _strength(library: Fit, spread: float, workers: Workers) -> float:
-    """The ridge with which a task that is left out is imitated best from one demonstration, kept with the library.
+    """The ridge with which a task that is left out is imitated best from one demonstration, kept with the
+    library.
 
     For each of :data:`MOST_TASKS` tasks the model is fitted without it, from the first of its starts. Each of
-    :data:`STRENGTHS` then adapts that model to the task's first demonstration, and the controls of the others are
-    expected. Their error decides: the likelihood would judge σ, too, of which one demonstration says little.
+    :data:`STRENGTHS` then adapts that model to the task's first demonstration, and the controls of the others
+    are expected. Their error decides: the likelihood would judge σ, too, of which one demonstration says
+    little.
 
     :raises BadInput: the demonstrations are of a single task.
     """

@@ -41,7 +41,9 @@ def checked(spec: Spec, given: Any) -> Named:
     named = {}
     for level, names in given.items():
         if level not in counts:
-            raise BadInput(f"there is no level {level!r}{nearest(level, counts)}; there is: {', '.join(counts)}")
+            raise BadInput(
+                f"there is no level {level!r}{nearest(level, counts)}; there is: {', '.join(counts)}"
+            )
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
             raise BadInput(f"level {level!r}: give a list of texts; quote a number")
         if len(names) != counts[level]:
@@ -87,18 +89,24 @@ def write_names(folder: Path, named: Named) -> None:
 
 
 def matched(
-    spec: Spec, train: Demonstrations, segments: Sequence[Sequence[np.ndarray]], trained: TrainedLabels | None = None
+    spec: Spec,
+    train: Demonstrations,
+    segments: Sequence[Sequence[np.ndarray]],
+    trained: TrainedLabels | None = None,
 ) -> list[NamedByLabel]:
     """The options that stand for labels of the demonstrations that they were trained with.
 
-    An option of a level with ``training.labels`` stands for its own label. Elsewhere options are matched with labels
-    so that as many steps as possible agree (Hungarian assignment). An option then stands for its label where more than
-    half of its labelled steps have that label, and more than half of the label's steps are in the option.
+    An option of a level with ``training.labels`` stands for its own label. Elsewhere options are matched with
+    labels so that as many steps as possible agree (Hungarian assignment). An option then stands for its label
+    where more than half of its labelled steps have that label, and more than half of the label's steps are in
+    the option.
 
     :param segments: the most likely choices of each level, of each demonstration [T].
     """
     levels, known = spec.levels, label_names(train.attributes)
-    labels = dict(zip((level.name for level in levels), spec.demonstrations.labels_by_level(len(levels)), strict=False))
+    labels = dict(
+        zip((level.name for level in levels), spec.demonstrations.labels_by_level(len(levels)), strict=False)
+    )
     found: list[NamedByLabel] = []
     for level, choices in zip(levels, segments, strict=True):
         own = trained if trained and trained.level == level.name else None
@@ -114,24 +122,36 @@ def matched(
                 continue
             here = np.equal(table.labels, value)[:, None] & np.equal(table.options, option)
             both = int(steps[here].sum())
-            each = int(steps[:, here.any(0)].sum()), int(steps[here.any(1)].sum())  # of the option, of the label
+            each = (
+                int(steps[:, here.any(0)].sum()),
+                int(steps[here.any(1)].sum()),
+            )  # of the option, of the label
             name = label_name(label, value, known.get(label, ()), level.name)
             taken = name in (option_name(0), *(one.name for one in found if one.level == level.name))
             if not taken and (own or 2 * both > max(each)):
                 share = both / (sum(each) - both) if both else 0.0
-                found.append(NamedByLabel(level=level.name, option=option, labels=label, name=name, agreement=share))
+                found.append(
+                    NamedByLabel(level=level.name, option=option, labels=label, name=name, agreement=share)
+                )
     return found
 
 
 def accepted(spec: Spec, found: Sequence[NamedByLabel]) -> Named:
-    """The names with an agreement of :data:`AGREED` or more, and those that ``training.labels`` gives by itself.
+    """The names with an agreement of :data:`AGREED` or more, and those that ``training.labels`` gives by
+    itself.
 
     Levels without any are left out.
     """
     named: Named = {}
     for level in spec.levels:
         given = spec.training.labels is not None and spec.training.labels.level == level.name
-        own = {one.option: one.name for one in found if one.level == level.name and (given or one.agreement >= AGREED)}
+        own = {
+            one.option: one.name
+            for one in found
+            if one.level == level.name and (given or one.agreement >= AGREED)
+        }
         if own:
-            named[level.name] = tuple(own.get(option, option_name(option)) for option in range(1, 1 + level.count))
+            named[level.name] = tuple(
+                own.get(option, option_name(option)) for option in range(1, 1 + level.count)
+            )
     return named

@@ -38,7 +38,11 @@ def policies(fit: Fit, best: bool = False) -> dict[str, Policy | str]:
     scripted: dict[str, Policy | str] = {name: name for name in fit.spec.rollout.policies}
     if best:
         return scripted | {fit.best.name: fit.best.controller()}
-    return scripted | {name: other.controller() for name, other in fit.baselines.items()} | {fit.name: fit.controller()}
+    return (
+        scripted
+        | {name: other.controller() for name, other in fit.baselines.items()}
+        | {fit.name: fit.controller()}
+    )
 
 
 def roll_out(
@@ -66,7 +70,12 @@ def roll_out(
     played = policies(fit, best)
     held = fit.metrics.rollouts
     whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
-    if held and whole and resume and all(_film(fit, name, seed).exists() for name in played for seed in seeds[:film]):
+    if (
+        held
+        and whole
+        and resume
+        and all(_film(fit, name, seed).exists() for name in played for seed in seeds[:film])
+    ):
         return held
     by_method: dict[str, list[dict[str, float]]] = {}
     for name, policy in played.items():
@@ -74,7 +83,9 @@ def roll_out(
         for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs, fit.spec.observed, ()):
             by_method[name].append(episode.outcome)
             if episode.frames:
-                names = [*policy.names.values()] if isinstance(policy, Controller) else []  # lowest level first
+                names = (
+                    [*policy.names.values()] if isinstance(policy, Controller) else []
+                )  # lowest level first
                 write_film(_film(fit, name, episode.seed), episode, names)
             on_event(Counted("rolling out", len(played) * episodes, method(name)))
     task = find_task(str(fit.spec.task))
@@ -110,20 +121,23 @@ def roll_out(
 def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1) -> None:
     """Roll out the repetitions of a fit from the initial states of its own rollouts.
 
-    Adds ``rollouts.seeds`` to the fit's metrics: success rates by method, and the parts of the worth. A fit without
-    repetitions stays as it is.
+    Adds ``rollouts.seeds`` to the fit's metrics: success rates by method, and the parts of the worth. A fit
+    without repetitions stays as it is.
     """
     rollouts, seeds = first.metrics.rollouts, first.metrics.seeds
     if seeds is None or rollouts is None:
         return
     each = [rollouts]
     for again in first.repetitions:
-        alone = replace(again, spec=with_overrides(again.spec, {"rollout.policies": []}))  # scripts have no seeds
+        alone = replace(
+            again, spec=with_overrides(again.spec, {"rollout.policies": []})
+        )  # scripts have no seeds
         each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
     rates = {name: [one.success_rates[name].rate for one in each] for name in each[-1].success_rates}
     parts = [one.worth.parts if one.worth else {} for one in each]
     points = {
-        part: [(own[part].only_ours - own[part].only_theirs) / rollouts.episodes for own in parts] for part in parts[0]
+        part: [(own[part].only_ours - own[part].only_theirs) / rollouts.episodes for own in parts]
+        for part in parts[0]
     }
     found = Seeds.model_validate({"training_seeds": seeds.training_seeds, "success": rates, "worth": points})
     first.metrics.rollouts = rollouts.model_copy(update={"seeds": found})

@@ -41,7 +41,8 @@ def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
 
 
 def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
-    """Make a folder the run of a spec, by writing ``spec.yaml``. An unfinished run of the same spec is continued.
+    """Make a folder the run of a spec, by writing ``spec.yaml``. An unfinished run of the same spec is
+    continued.
 
     A spec that differs in its ``report`` alone is the same, and replaces the one in the folder.
 
@@ -52,7 +53,9 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     if path.exists():
         same = same_model = path.read_bytes() == text.encode()
         with suppress(SpecError):  # user code is not imported by reading its name
-            same_model = same or load_spec(path, allow_code=True).model_copy(update={"report": spec.report}) == spec
+            same_model = (
+                same or load_spec(path, allow_code=True).model_copy(update={"report": spec.report}) == spec
+            )
         if not same_model:
             raise BadInput(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and is_finished(folder) and (folder / "report.html").exists():  # what `fit` writes last

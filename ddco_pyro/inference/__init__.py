@@ -1,7 +1,7 @@
 """Exact inference in the AHMM: likelihoods by two engines, posteriors, and paths.
 
-Each function here checks its tables and lengths, and raises :class:`BadTables` (a ``ValueError``) where they do not fit
-together. The library's own training and evaluation call the unchecked functions in the modules.
+Each function here checks its tables and lengths, and raises :class:`BadTables` (a ``ValueError``) where they
+do not fit together. The library's own training and evaluation call the unchecked functions in the modules.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ segment = checked(paths.segment)
 
 
 def compile_all() -> None:
-    """Compile the recursions, or read them from the cache on disk, before other processes look for them there.
+    """Compile the recursions, or read them from the cache on disk, before other processes look for them
+    there.
 
     Compiling takes 5 CPU seconds, once for each installation.
     """

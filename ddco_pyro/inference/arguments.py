@@ -1,6 +1,8 @@
-"""Checks of the arguments of public inference functions: tables of fitting shapes, and the length of each trajectory.
+"""Checks of the arguments of public inference functions: tables of fitting shapes, and the length of each
+trajectory.
 
-The compiled engines index without bounds checks, so a wrong length or shape would read and write foreign memory.
+The compiled engines index without bounds checks, so a wrong length or shape would read and write foreign
+memory.
 """
 
 from __future__ import annotations
@@ -34,10 +36,11 @@ def checked(function: Function) -> Function:
 
 
 def check(tables: Tables, lengths: Tensor) -> Tensor:
-    """The lengths as int64, once tables have the shapes of :class:`ddco_pyro.model.tables.Tables` and fit the lengths.
+    """The lengths as int64, once tables have the shapes of :class:`ddco_pyro.model.tables.Tables` and fit the
+    lengths.
 
-    :raises BadTables: a table is missing, has another shape or is not floating-point; a length is out of range; or a
-        log-probability within the lengths is NaN or +inf.
+    :raises BadTables: a table is missing, has another shape or is not floating-point; a length is out of
+        range; or a log-probability within the lengths is NaN or +inf.
     """
     number, steps = _sizes(tables)
     lengths = check_lengths(lengths, number, steps)
@@ -59,7 +62,9 @@ def check_lengths(lengths: Tensor, number: int, steps: int) -> Tensor:
     :raises BadTables: the lengths are no integer tensor [N], or one is out of range.
     """
     if not isinstance(lengths, Tensor) or lengths.is_floating_point() or lengths.dtype == torch.bool:
-        raise BadTables(f"lengths: give a tensor of integers, one for each trajectory; got {_described(lengths)}")
+        raise BadTables(
+            f"lengths: give a tensor of integers, one for each trajectory; got {_described(lengths)}"
+        )
     if lengths.shape != (number,):
         raise BadTables(f"lengths: there are {number} trajectories; got {_described(lengths)}")
     for n, length in enumerate(lengths.tolist()):
@@ -74,7 +79,9 @@ def refuse_impossible(possible: Tensor) -> None:
     :raises BadTables: there is such a trajectory.
     """
     for n in torch.nonzero(~possible).flatten().tolist():
-        raise BadTables(f"trajectory {n} has probability 0 whatever its options, so there is no posterior of its path")
+        raise BadTables(
+            f"trajectory {n} has probability 0 whatever its options, so there is no posterior of its path"
+        )
 
 
 def _sizes(tables: Tables) -> tuple[int, int]:
@@ -89,10 +96,14 @@ def _sizes(tables: Tables) -> tuple[int, int]:
             raise BadTables(f"{name}: tables with {depth} levels of selections need {needed}; got {got}")
     for level, table in enumerate(tables.selection):
         if table.dim() != 4 or table.shape[-1] < 2:
-            raise BadTables(f"selection[{level}]: expected [N, T, callers, 1 + options]; got {_described(table)}")
+            raise BadTables(
+                f"selection[{level}]: expected [N, T, callers, 1 + options]; got {_described(table)}"
+            )
     last = tables.control[-1]
     if last.dim() != 3 or not len(last):
-        raise BadTables(f"control[{depth}]: expected the shape [N, T, 1] with N at least 1; got {_described(last)}")
+        raise BadTables(
+            f"control[{depth}]: expected the shape [N, T, 1] with N at least 1; got {_described(last)}"
+        )
     return last.shape[0], last.shape[1]
 
 

@@ -30,7 +30,8 @@ TOLERANCE = 1e-6
 
 
 def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") -> Tensor:
-    """log p(ξ) of each trajectory in nats, [N] float64, differentiable in the tables; -inf where ξ is impossible.
+    """log p(ξ) of each trajectory in nats, [N] float64, differentiable in the tables; -inf where ξ is
+    impossible.
 
     Without dynamics: p(ξ) is Σ_ζ p(ζ, a | s) of §4.1. The fused engine is differentiable once.
 
@@ -69,8 +70,8 @@ class EngineCheck(NamedTuple):
 def compare_engines(outputs: Outputs, actions: Tensor, lengths: Tensor) -> EngineCheck:
     """Compare value and gradient of the fused engine with Pyro's enumeration of the program, in float64.
 
-    Gradients are with respect to the networks' outputs. The fused engine eliminates logits and densities; the program
-    scores the controls [N, T, A] by the emissions themselves.
+    Gradients are with respect to the networks' outputs. The fused engine eliminates logits and densities; the
+    program scores the controls [N, T, A] by the emissions themselves.
     """
     controls = actions.double()
 
@@ -98,11 +99,14 @@ def _with_gradient(outputs: Outputs, engine: Callable[[Outputs], Tensor]) -> tup
     return value.detach(), torch.cat([gradient.flatten() for gradient in gradients])
 
 
-# --- Pyro's enumeration -----------------------------------------------------------------------------------------------
+# --- Pyro's enumeration -------------------------------------------------------------------------------------
 
 
 def enumerated(
-    tables: Tables, lengths: Tensor, emissions: Sequence[Steps | None] | None = None, actions: Tensor | None = None
+    tables: Tables,
+    lengths: Tensor,
+    emissions: Sequence[Steps | None] | None = None,
+    actions: Tensor | None = None,
 ) -> Tensor:
     """log p(ξ) of each trajectory, [N] float64, differentiable in the tables.
 
@@ -115,7 +119,10 @@ def enumerated(
     chain = complete(tables, lengths)
     unused = ~chain.alive[..., None, None]  # may hold NaN
     chain = replace(chain, selection=tuple(table.masked_fill(unused, 0.0) for table in chain.selection))
-    with pyro.poutine.enum(first_available_dim=-2), pyro.poutine.trace() as traced:  # the plate has dimension -1
+    with (
+        pyro.poutine.enum(first_available_dim=-2),
+        pyro.poutine.trace() as traced,
+    ):  # the plate has dimension -1
         ahmm(chain, emissions, actions)
     trace = traced.trace
     trace.compute_log_prob()

@@ -1,7 +1,9 @@
-"""The fused engine: the log-likelihood of tables by one compiled pass, whose gradient is the posterior (§4.1).
+"""The fused engine: the log-likelihood of tables by one compiled pass, whose gradient is the posterior
+(§4.1).
 
-The pass works in scaled probability space and measures its own error. A trajectory that underflows there is done again
-in log space. torch computes the tables from the networks' outputs, and takes the posterior back to them.
+The pass works in scaled probability space and measures its own error. A trajectory that underflows there is
+done again in log space. torch computes the tables from the networks' outputs, and takes the posterior back to
+them.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from ddco_pyro.model.tables import Tables, complete
 
 
 class Elimination(NamedTuple):
-    """Result of one pass over N trajectories of at most T steps. Posteriors are float64, and 0 past a trajectory's end.
+    """Result of one pass over N trajectories of at most T steps. Posteriors are float64, and 0 past a
+    trajectory's end.
 
     :param value: log p(ξ), [N].
     :param tables: the posterior of each table's entries, in the tables' shapes; without evidence.
@@ -37,7 +40,9 @@ class Eliminate(torch.autograd.Function):
     """Log-likelihoods of tables; the gradient with respect to a log-table is the posterior of its entries."""
 
     @staticmethod
-    def forward(ctx: Any, depth: int, power: float, logits: bool, lengths: Tensor, *leaves: Tensor | None) -> Tensor:
+    def forward(
+        ctx: Any, depth: int, power: float, logits: bool, lengths: Tensor, *leaves: Tensor | None
+    ) -> Tensor:
         """log p(ξ), [N]."""
         tables = Tables.of(depth, leaves, power, logits)
         found = _eliminated(tables, lengths, any(ctx.needs_input_grad[3 * depth + 5 :]), gradient=True)
@@ -49,7 +54,8 @@ class Eliminate(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         """The posteriors, weighted with ``upstream`` [N].
 
-        :raises RuntimeError: a graph of the gradient is asked for, to differentiate again: it would silently be 0.
+        :raises RuntimeError: a graph of the gradient is asked for, to differentiate again: it would silently
+            be 0.
         """
         if torch.is_grad_enabled():
             raise RuntimeError(
@@ -133,12 +139,16 @@ def _split(tables: Tables, rows: Tensor, marginals: bool) -> tuple[Tables, tuple
     shaped = [part.unflatten(2, table.shape[2:]) for part, table in zip(parts, each, strict=False)]
     depth = tables.depth
     return (
-        Tables((*shaped[:depth],), (*shaped[depth : 2 * depth],), (*shaped[2 * depth + 1 :], shaped[2 * depth])),
+        Tables(
+            (*shaped[:depth],), (*shaped[depth : 2 * depth],), (*shaped[2 * depth + 1 :], shaped[2 * depth])
+        ),
         parts[len(each) :],
     )
 
 
-def _repeat_in_log_space(tables: Tables, n: int, length: int, elimination: Elimination, gradient: bool) -> None:
+def _repeat_in_log_space(
+    tables: Tables, n: int, length: int, elimination: Elimination, gradient: bool
+) -> None:
     """Eliminate a trajectory in log space and write the results into ``elimination``."""
     alone = tables.part(torch.tensor([n]), length)
     alone = alone if gradient else alone.normalised()

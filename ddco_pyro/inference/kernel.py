@@ -1,17 +1,20 @@
 """The recursions of the AHMM over a trajectory, compiled; O(D·S) a step for S joint choices.
 
-:func:`eliminate` goes forward over probabilities and back for the gradient, with :data:`LANES` trajectories side by
-side. :func:`trace` is the same forward recursion over logarithms of one trajectory, and goes back along paths.
+:func:`eliminate` goes forward over probabilities and back for the gradient, with :data:`LANES` trajectories
+side by side. :func:`trace` is the same forward recursion over logarithms of one trajectory, and goes back
+along paths.
 
-:class:`Structure` numbers joint choices and messages. Row t of ``messages`` [1 + T, M] begins with the forward mass of
-the joint choices at t - 1. Above level 1 the row has the mass that terminated at every level below, at t. Row t of
-``spread`` [T, M] has the mass that comes down again: the selected mass and the kept mass.
+:class:`Structure` numbers joint choices and messages. Row t of ``messages`` [1 + T, M] begins with the
+forward mass of the joint choices at t - 1. Above level 1 the row has the mass that terminated at every level
+below, at t. Row t of ``spread`` [T, M] has the mass that comes down again: the selected mass and the kept
+mass.
 
-Tables of all levels stand side by side in rows [N, T, columns]: selections, terminations, the meta-policy's control,
-the options' controls, and factors of the joint choices where there is evidence.
+Tables of all levels stand side by side in rows [N, T, columns]: selections, terminations, the meta-policy's
+control, the options' controls, and factors of the joint choices where there is evidence.
 
-All compiled functions are in this file, so that numba's cache, which looks at the file of an entry point, is right.
-Arrays are allocated by callers and indexed in full: numba takes seconds to compile allocations and slices.
+All compiled functions are in this file, so that numba's cache, which looks at the file of an entry point, is
+right. Arrays are allocated by callers and indexed in full: numba takes seconds to compile allocations and
+slices.
 """
 
 from __future__ import annotations
@@ -50,19 +53,21 @@ STEPS_A_THREAD = 4096
 class Structure(NamedTuple):
     """Index tables of D levels, lowest first. C_d = 1 + k_d counts a level's choices, control among them.
 
-    A joint choice is one index, with h^D as the slowest digit and h^1 as the fastest. A *message* of level d runs over
-    (h^D, ..., h^d). The messages of levels 1 to D + 1 stand one after the other, M entries in all; level D + 1 has one.
+    A joint choice is one index, with h^D as the slowest digit and h^1 as the fastest. A *message* of level d
+    runs over (h^D, ..., h^d). The messages of levels 1 to D + 1 stand one after the other, M entries in all;
+    level D + 1 has one.
 
     :param columns: of a row, without the factors of joint choices.
-    :param callers: for each message entry above level 1: its first entry below, the number C of entries below, its
-        first column in a row as their caller, and the column of their first termination; [M - S, 4]. A caller below a
-        choice 0 has no column, but :data:`IMPOSSIBLE`.
-    :param actors: for each joint choice, the acting caller's column; :data:`IMPOSSIBLE` where the joint choice is, [S].
-    :param choices: for each joint choice, the columns of its choices in a row of posteriors, which has marginals in
-        place of the factors, [S, D].
+    :param callers: for each message entry above level 1: its first entry below, the number C of entries
+        below, its first column in a row as their caller, and the column of their first termination; [M - S,
+        4]. A caller below a choice 0 has no column, but :data:`IMPOSSIBLE`.
+    :param actors: for each joint choice, the acting caller's column; :data:`IMPOSSIBLE` where the joint
+        choice is, [S].
+    :param choices: for each joint choice, the columns of its choices in a row of posteriors, which has
+        marginals in place of the factors, [S, D].
     :param above: for each message entry below level D + 1, the entry of its caller, [M - 1].
-    :param groups: the first column and the number of columns of each choice that is made: each selection and each
-        termination, whose probabilities sum to 1, and last of the controls, [G, 2].
+    :param groups: the first column and the number of columns of each choice that is made: each selection and
+        each termination, whose probabilities sum to 1, and last of the controls, [G, 2].
     :param inert: the logarithms of a step that keeps every choice, [columns].
     """
 
@@ -124,7 +129,8 @@ def _offsets(sizes: Sequence[int]) -> Array:
 
 
 def on_threads(run: Callable[[int, int], object], lengths: Tensor) -> None:
-    """Call ``run(first, last)`` for parts of the trajectories, on at most ``torch.get_num_threads()`` threads.
+    """Call ``run(first, last)`` for parts of the trajectories, on at most ``torch.get_num_threads()``
+    threads.
 
     torch itself works on one thread meanwhile: its own threads wait busily, and these would wait for them.
 
@@ -145,11 +151,13 @@ def on_threads(run: Callable[[int, int], object], lengths: Tensor) -> None:
 
 
 inner = numba.njit(error_model="numpy", fastmath={"contract"}, inline="always")
-entry: Callable[[Callable[..., None]], Callable[..., None]] = numba.njit(  # numba's own type knows no unpacking
-    error_model="numpy", fastmath={"contract"}, nogil=True, cache=True
+entry: Callable[[Callable[..., None]], Callable[..., None]] = (
+    numba.njit(  # numba's own type knows no unpacking
+        error_model="numpy", fastmath={"contract"}, nogil=True, cache=True
+    )
 )
 
-# --- trajectories side by side ---------------------------------------------------------------------------------------
+# --- trajectories side by side ------------------------------------------------------------------------------
 
 LANES = 8
 """Trajectories side by side: numbers of one vector instruction."""
@@ -257,10 +265,11 @@ def _load(
 
 @inner
 def _forward(room: Array, p: int, number: int, columns: int, t: int, callers: Array, actors: Array) -> None:
-    """Fill the rest of step t and level 1 of the messages after it; their sum before they are scaled is :data:`TOTAL`.
+    """Fill the rest of step t and level 1 of the messages after it; their sum before they are scaled is
+    :data:`TOTAL`.
 
-    :param p: row of the first of ``number`` probabilities at t. The messages, the spread mass, and one row for the
-        scale follow.
+    :param p: row of the first of ``number`` probabilities at t. The messages, the spread mass, and one row
+        for the scale follow.
     """
     choices, last = len(actors), len(callers) - 1
     m, spread = p + number, p + number + choices + len(callers)
@@ -295,8 +304,8 @@ def _backward(
     room: Array, p: int, number: int, columns: int, t: int, gain: int, gains: int, callers: Array, actors: Array,
     choices: Array,
 ) -> None:  # fmt: skip
-    """Adjoint of :func:`_forward`: the rows from :data:`FIXED` on go from β_t to β of t - 1. Fill ``gain`` with the
-    posteriors.
+    """Adjoint of :func:`_forward`: the rows from :data:`FIXED` on go from β_t to β of t - 1. Fill ``gain``
+    with the posteriors.
 
     :data:`TOTAL` is Σ_s α_t(s) β_t(s).
     """
@@ -346,11 +355,12 @@ def eliminate(
 ) -> None:  # fmt: skip
     """Fill ``value``, ``exact`` and the posteriors, with :data:`LANES` trajectories in a block.
 
-    Each step is scaled to a mass of 1. Underflow there matters only where the past makes next to impossible what the
-    future demands. Then Σ_s α_t(s) β_t(s) is not 1, and the trajectory is not ``exact``.
+    Each step is scaled to a mass of 1. Underflow there matters only where the past makes next to impossible
+    what the future demands. Then Σ_s α_t(s) β_t(s) is not 1, and the trajectory is not ``exact``.
 
     :param order: the trajectories [M] of N; those of a block should be about as long.
-    :param rows: their log-probabilities in this order; of selections and terminations logits where ``logits`` says so.
+    :param rows: their log-probabilities in this order; of selections and terminations logits where ``logits``
+        says so.
     :param posterior: or the derivative of log p(ξ) with respect to ``rows``, where ``gradient`` says so.
     :param value: log p(ξ), [N]; ``exact`` likewise.
     :param room: of :func:`room_for`.
@@ -368,7 +378,9 @@ def eliminate(
         multiply(room, PRODUCT, ONE, ONE)
         multiply(room, LEAST, ONE, ONE)
         for i in range(size):
-            multiply(room, begin + number + i, ZERO if i < size - 1 else ONE, ONE)  # at t = 0 everything is selected
+            multiply(
+                room, begin + number + i, ZERO if i < size - 1 else ONE, ONE
+            )  # at t = 0 everything is selected
         for t in range(longest):
             p = begin + t * stride
             _load(room, p, t, block, order, lengths, rows, logits, power != 1.0, columns, groups, inert)
@@ -405,7 +417,9 @@ def eliminate(
                 reached = room[LANES * (FIXED + i) + lane]
                 most = reached if not reached <= most else most  # NaN is not
             value[n] = room[LANES * FOUND + lane] + math.log(room[LANES * PRODUCT + lane])
-            within = room[LANES * LEAST + lane] >= SMALL and room[LANES * WORST + lane] <= TOLERANCE * TOLERANCE
+            within = (
+                room[LANES * LEAST + lane] >= SMALL and room[LANES * WORST + lane] <= TOLERANCE * TOLERANCE
+            )
             exact[n] = within and most <= LARGE and abs(value[n]) < np.inf
             for t in range(lengths[n], posterior.shape[1]):
                 for c in range(gains):
@@ -417,7 +431,7 @@ def room_for(steps: int, columns: int, gains: int, entries: int) -> Array:
     return np.empty(LANES * (FIXED + entries + gains + (steps + 1) * (columns + 2 * entries + 1)))
 
 
-# --- trajectories alone, in logarithms --------------------------------------------------------------------------------
+# --- trajectories alone, in logarithms ----------------------------------------------------------------------
 
 LOG_SUM, LARGEST = range(2)
 """Semirings: sums of probabilities, and maxima, both of their logarithms."""
@@ -511,7 +525,11 @@ def _back(
             level += 1
         ended[n, m, t] = level
         for d in range(level - 1 if t > 0 else -1, -1, -1):
-            i, mass, left = entry - len(actors), messages[t, entry], uniforms[n, m, t, uniforms.shape[3] // 2 + d]
+            i, mass, left = (
+                entry - len(actors),
+                messages[t, entry],
+                uniforms[n, m, t, uniforms.shape[3] // 2 + d],
+            )
             entry = callers[i, 0]
             for j in range(callers[i, 1]):
                 part = messages[t, callers[i, 0] + j]
@@ -529,15 +547,15 @@ def trace(
     possible: Array, messages: Array, spread: Array, columns: int, callers: Array, actors: Array, choices: Array,
     above: Array,
 ) -> None:  # fmt: skip
-    """Fill the ``joint`` choices [N, M, T] of M paths, and how many levels ``ended`` before each. Paths are the most
-    likely one (:data:`LARGEST`), or draws from p(ζ | ξ) (:data:`LOG_SUM`).
+    """Fill the ``joint`` choices [N, M, T] of M paths, and how many levels ``ended`` before each. Paths are
+    the most likely one (:data:`LARGEST`), or draws from p(ζ | ξ) (:data:`LOG_SUM`).
 
     ``possible`` [N] says which trajectories have a probability above 0; others have no paths.
 
     :param rows: log-probabilities.
     :param uniforms: numbers uniform in [0, 1), [N, M, 1 + T, 2·D]; zeros for the most likely path.
-    :param predicted: filled with the log-probabilities of joint choices before the control of each step, [N, T, S];
-        [N, 0, S] where they are not wanted.
+    :param predicted: filled with the log-probabilities of joint choices before the control of each step, [N,
+        T, S]; [N, 0, S] where they are not wanted.
     """
     for n in range(len(lengths)):
         for i in range(messages.shape[1]):

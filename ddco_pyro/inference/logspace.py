@@ -1,8 +1,9 @@
-"""Elimination of the latents in log space, step by step, O(D·S) a step for S joint choices; and the online filter.
+"""Elimination of the latents in log space, step by step, O(D·S) a step for S joint choices; and the online
+filter.
 
-The transition is a mixture over how far up the terminations reach, so a forward step never builds the S × S matrix.
-On the way up each level keeps its choice or passes its mass on. On the way down the selections spread the passed mass,
-which joins the kept mass.
+The transition is a mixture over how far up the terminations reach, so a forward step never builds the S × S
+matrix. On the way up each level keeps its choice or passes its mass on. On the way down the selections spread
+the passed mass, which joins the kept mass.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ def arrive(message: Tensor | None, now: Chain) -> Tensor:
     """
     kept: list[Tensor] = []
     if message is None:
-        message = torch.zeros(len(now.alive), dtype=torch.float64, device=now.alive.device)  # everything is selected
+        message = torch.zeros(
+            len(now.alive), dtype=torch.float64, device=now.alive.device
+        )  # everything is selected
     else:
         for table in now.termination:
             keep, terminate = _along_last(table[..., 0], message), _along_last(table[..., 1], message)
@@ -70,9 +73,11 @@ def marginal(joint: Tensor, level: int) -> Tensor:
 
 
 class Filter:
-    """An exact online filter: call :meth:`predict` with each step's tables, then :meth:`update` with its control.
+    """An exact online filter: call :meth:`predict` with each step's tables, then :meth:`update` with its
+    control.
 
-    Evidence in a step's tables conditions the belief at this step and later ones; it has to be of the past alone.
+    Evidence in a step's tables conditions the belief at this step and later ones; it has to be of the past
+    alone.
 
     :param power: β, how many times the log-density of a control counts in later beliefs.
     :ivar log_likelihood: log p(a_0..t-1 | s) so far, [N] nats.
@@ -98,7 +103,9 @@ class Filter:
         assert self._message is not None  # predict() has been called
         total = _log_mass(self._message + density)
         if not bool(torch.isfinite(total).all()):
-            raise ValueError("the control has probability 0 under every choice; is it in the demonstrations' units?")
+            raise ValueError(
+                "the control has probability 0 under every choice; is it in the demonstrations' units?"
+            )
         self.log_likelihood = self.log_likelihood + total
         self._message = _normalised(self._message + self.power * density)
 

@@ -22,12 +22,14 @@ from ddco_pyro.model.tables import complete
 
 
 class EliminatedAHMM(TorchDistribution):
-    """The controls of N demonstrations given their observations: Σ_ζ p(ζ, a | s), without the dynamics (§4.1).
+    """The controls of N demonstrations given their observations: Σ_ζ p(ζ, a | s), without the dynamics
+    (§4.1).
 
     In a plate over demonstrations it replaces the enumerated model :func:`ddco_pyro.model.ahmm.ahmm`:
     ``pyro.sample("controls", EliminatedAHMM(hierarchy(batch.inputs), batch.lengths), obs=batch.actions)``.
-    Its gradient is the posterior; second derivatives raise an error. The batch shape is [N], the event shape [T, A].
-    ``log_prob`` is float64, which NUTS makes the type of all weights: :func:`bayesian_ahmm` gives networks their own.
+    Its gradient is the posterior; second derivatives raise an error. The batch shape is [N], the event shape
+    [T, A]. ``log_prob`` is float64, which NUTS makes the type of all weights: :func:`bayesian_ahmm` gives
+    networks their own.
 
     >>> from ddco_pyro.model.batch import encode
     >>> batch = encode(demos, fit.hierarchy.encoder, fit.hierarchy.scaling)
@@ -71,12 +73,14 @@ class EliminatedAHMM(TorchDistribution):
 
 
 def bayesian_ahmm(
-    hierarchy: Hierarchy, priors: Mapping[str, TorchDistribution] | Callable[[], Mapping[str, Tensor]], batch: Batch
+    hierarchy: Hierarchy,
+    priors: Mapping[str, TorchDistribution] | Callable[[], Mapping[str, Tensor]],
+    batch: Batch,
 ) -> Outputs:
     """The AHMM with priors on its weights, as a Pyro program: options and terminations are eliminated (§4.1).
 
-    Bind hierarchy and priors with :func:`functools.partial` for a guide, SVI or NUTS. Each prior is a site with the
-    parameter's name, in which ``_`` replaces each dot. Other parameters are the hierarchy's own.
+    Bind hierarchy and priors with :func:`functools.partial` for a guide, SVI or NUTS. Each prior is a site
+    with the parameter's name, in which ``_`` replaces each dot. Other parameters are the hierarchy's own.
 
     >>> import pyro, pyro.distributions as dist
     >>> from ddco_pyro.inference.marginal import bayesian_ahmm
@@ -88,8 +92,9 @@ def bayesian_ahmm(
     >>> len(trace.stochastic_nodes) == len(weights), trace.nodes["controls"]["value"].shape
     (True, torch.Size([6, 10, 2]))
 
-    :param priors: a distribution of each parameter by its name, with the parameter's shape as event shape; or a Pyro
-        program that draws parameters by name, such as that of a library (:class:`~ddco_pyro.training.prior.Prior`).
+    :param priors: a distribution of each parameter by its name, with the parameter's shape as event shape; or
+        a Pyro program that draws parameters by name, such as that of a library
+        (:class:`~ddco_pyro.training.prior.Prior`).
     :return: the networks' outputs under the drawn weights.
     """
     if isinstance(priors, Mapping):

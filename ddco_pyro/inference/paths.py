@@ -1,7 +1,7 @@
 """Whole paths ζ = (b, h) of the latents: the most likely path of a demonstration, and draws from p(ζ | ξ).
 
-:mod:`ddco_pyro.inference.kernel` goes forward in logarithms, O(D·S) a step, and takes a path one step back after the
-other, O(D + Σ C_d) a step.
+:mod:`ddco_pyro.inference.kernel` goes forward in logarithms, O(D·S) a step, and takes a path one step back
+after the other, O(D + Σ C_d) a step.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Path(NamedTuple):
 def most_likely_path(tables: Tables, lengths: Tensor) -> Path:
     """argmax over ζ of p(ζ | ξ) (Viterbi), [N, T] for every level.
 
-    Ties are broken from the last step back. The lowest last choice wins, comparing the highest level first. Keeping
-    a choice then wins over selecting it anew, and the lowest previous choice over others.
+    Ties are broken from the last step back. The lowest last choice wins, comparing the highest level first.
+    Keeping a choice then wins over selecting it anew, and the lowest previous choice over others.
 
     :param lengths: steps of each trajectory, int64 [N].
     :raises BadTables: a trajectory has probability 0.
@@ -46,7 +46,9 @@ def most_likely_path(tables: Tables, lengths: Tensor) -> Path:
     >>> most_likely_path(tables, torch.tensor([4])).choices
     (tensor([[1, 1, 2, 2]]),)
     """
-    path = _trace(tables, lengths, kernel.LARGEST, np.zeros((1, len(lengths), tables.steps + 1, 2 * tables.depth)))
+    path = _trace(
+        tables, lengths, kernel.LARGEST, np.zeros((1, len(lengths), tables.steps + 1, 2 * tables.depth))
+    )
     return Path(tuple(h[0] for h in path.choices), tuple(b[0] for b in path.terminations))
 
 
@@ -105,7 +107,9 @@ def _trace(tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray)
     digits = structure.choices.T - structure.choices[0][:, None]
     ends = (np.arange(tables.depth + 1) > level for level in range(tables.depth))
     return Path(
-        tuple(torch.from_numpy(np.append(digit, -1)[joint]) for digit in digits),  # -1, past the end, is the last entry
+        tuple(
+            torch.from_numpy(np.append(digit, -1)[joint]) for digit in digits
+        ),  # -1, past the end, is the last entry
         tuple(torch.from_numpy(np.append(end.astype(np.int64), -1)[ended]) for end in ends),
     )
 

@@ -1,7 +1,7 @@
 """Posterior marginals of the latents, the E-step of §4.1, and the predictive log-likelihood.
 
-A posterior is a gradient: the derivative of log p(ξ) with respect to the logarithm of a table's entry is the posterior
-probability that the entry was used.
+A posterior is a gradient: the derivative of log p(ξ) with respect to the logarithm of a table's entry is the
+posterior probability that the entry was used.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from ddco_pyro.model.tables import NEVER, Tables, joint_density
 class Posterior(NamedTuple):
     """Marginals of §4.1 for every level, lowest first, each float64 [N, T, 1 + k_d] with control as choice 0.
 
-    ``u``: p(h_t = h | ξ). ``v``: p(b_t = 1, h_t = h | ξ). ``w``: p(h_t = h, b_{t+1} = 0 | ξ), 0 at the last step.
-    Steps past a trajectory's length are 0.
+    ``u``: p(h_t = h | ξ). ``v``: p(b_t = 1, h_t = h | ξ). ``w``: p(h_t = h, b_{t+1} = 0 | ξ), 0 at the last
+    step. Steps past a trajectory's length are 0.
     """
 
     u: tuple[Tensor, ...]
@@ -53,7 +53,9 @@ def posterior(tables: Tables, lengths: Tensor) -> Posterior:
     refuse_impossible(found.value > NEVER)
     posteriors, u = found.tables, found.marginals
     v = tuple(
-        torch.cat([u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1)  # choice 0 lasts one step: it is always selected
+        torch.cat(
+            [u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1
+        )  # choice 0 lasts one step: it is always selected
         for u_d, selected in zip(u, posteriors.selection, strict=True)
     )
     followed = (torch.arange(1, tables.steps) < lengths[:, None]).unsqueeze(-1)
@@ -64,10 +66,12 @@ def posterior(tables: Tables, lengths: Tensor) -> Posterior:
 
 
 def log_predictive(tables: Tables, lengths: Tensor) -> Tensor:
-    """Σ_t log p(a_t | s_0..t, a_0..t-1) of each trajectory, nats, [N] float64, whatever the power β of the tables.
+    """Σ_t log p(a_t | s_0..t, a_0..t-1) of each trajectory, nats, [N] float64, whatever the power β of the
+    tables.
 
-    A power changes the beliefs over options in which past controls count; each control is scored by its density. With
-    β = 1 the sum is log p(ξ). The gradient with respect to ``tables.control`` is the belief after each control.
+    A power changes the beliefs over options in which past controls count; each control is scored by its
+    density. With β = 1 the sum is log p(ξ). The gradient with respect to ``tables.control`` is the belief
+    after each control.
 
     :param lengths: steps of each trajectory, int64 [N].
     """

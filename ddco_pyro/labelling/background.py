@@ -49,8 +49,8 @@ class Background:
     def begin(self, call: Call, prepare: Callable[[Any], Callable[[], None]]) -> None:
         """Make a call.
 
-        :param prepare: gets the result in a thread of its own. What it gives is called, with the lock, unless the call
-            was cancelled meanwhile.
+        :param prepare: gets the result in a thread of its own. What it gives is called, with the lock, unless
+            the call was cancelled meanwhile.
         """
         with self.lock:
             self.error = ""

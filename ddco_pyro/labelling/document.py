@@ -1,6 +1,8 @@
-"""What a person has said of the options of one level, with undo and redo without end, and the file that keeps it.
+"""What a person has said of the options of one level, with undo and redo without end, and the file that keeps
+it.
 
-A document knows no model, and the list of its edits is all of it. Each edit is on disk before it is acknowledged.
+A document knows no model, and the list of its edits is all of it. Each edit is on disk before it is
+acknowledged.
 """
 
 from __future__ import annotations
@@ -29,9 +31,10 @@ PAINT, CONFIRM = "paint", "confirm"
 """A person gives steps a label, or accepts the one that is proposed."""
 
 Change = tuple[Any, ...]
-"""(:data:`PAINT` or :data:`CONFIRM`, demonstration, start, stop, option), ("cut", demonstration, step, whether),
-("accept", demonstration, whether, steps of it that were expected wrong, steps of it that were), ("mark", demonstration,
-one of :data:`MARKS`, its value), ("names", names of the options 1 to k) or ("colour", name of an option, colour)."""
+"""(:data:`PAINT` or :data:`CONFIRM`, demonstration, start, stop, option), ("cut", demonstration, step,
+whether), ("accept", demonstration, whether, steps of it that were expected wrong, steps of it that were),
+("mark", demonstration, one of :data:`MARKS`, its value), ("names", names of the options 1 to k) or ("colour",
+name of an option, colour)."""
 
 Edit = list[tuple[Any, str, Any]]
 """Values to put into tables of a document: (table, key, value), where None takes the key away."""
@@ -48,8 +51,8 @@ class Document:
     :ivar labels: of each demonstration [T]: an option 1 to k, :data:`FREE` or :data:`OPEN`.
     :ivar given: whether a person gave each label, rather than accepted what was proposed, bool [T].
     :ivar cuts: steps at which a segment begins although the option stays.
-    :ivar accepted: demonstrations that a person is done with: of each the steps whose first proposal was expected to be
-        wrong, and the steps in which it was.
+    :ivar accepted: demonstrations that a person is done with: of each the steps whose first proposal was
+        expected to be wrong, and the steps in which it was.
     :ivar marks: of each demonstration, the :data:`MARKS` that a person gave it.
     :ivar colours: that a person gave to options, by their names.
     :ivar undone: edits that can be done again, the next one last.
@@ -129,7 +132,7 @@ def _put(edit: Iterable[tuple[Any, str, Any]]) -> Edit:
     return back[::-1]
 
 
-# --- the file of edits ------------------------------------------------------------------------------------------------
+# --- the file of edits --------------------------------------------------------------------------------------
 
 SUFFIX = ".journal"
 """Of the file of edits, beside the file of labels."""
@@ -170,7 +173,9 @@ def replay(path: Path, content: bytes, document: Document, labels: str) -> tuple
         if lines:
             known = json.loads(lines[0])
             if known["labels"] != labels:
-                raise BadInput(f"{path}: has edits of other demonstrations or of another level; give another --out")
+                raise BadInput(
+                    f"{path}: has edits of other demonstrations or of another level; give another --out"
+                )
             document.names = tuple(known["names"])
         for line in lines[1:]:
             number += 1
@@ -233,7 +238,8 @@ class Journal:
     def write(self, entry: str | Sequence[Change]) -> None:
         """Edit the document, once that is on disk.
 
-        :param entry: changes, :data:`UNDO`, :data:`REDO`, or :data:`SAVED` where all edits are in the file of labels.
+        :param entry: changes, :data:`UNDO`, :data:`REDO`, or :data:`SAVED` where all edits are in the file of
+            labels.
         :raises BadInput: there is nothing to undo or to redo.
         """
         if entry in (UNDO, REDO) and not (self.document.done if entry == UNDO else self.document.undone):
@@ -244,10 +250,13 @@ class Journal:
 
     def at(self, address: str = "") -> None:
         """Say who has the file, and where it can be edited, for processes that are refused."""
-        self._lock.write_text(f"a process of {getpass.getuser()}, {os.getpid()}{address and f', at {address}'}")
+        self._lock.write_text(
+            f"a process of {getpass.getuser()}, {os.getpid()}{address and f', at {address}'}"
+        )
 
     def others(self) -> dict[str, Document]:
-        """What each other annotator has said by now, by name; journals of other demonstrations are passed over.
+        """What each other annotator has said by now, by name; journals of other demonstrations are passed
+        over.
 
         The journals of annotators lie side by side, as ``<start>_<annotator>.<end>``.
         """

@@ -41,7 +41,9 @@ class Following:
     def __init__(self, path: Path, demos: Demonstrations, trajectory: Sequence[PathSpec] | None) -> None:
         self.path, self.demos, self.paths, self.opened = path, demos, trajectory or (), ExitStack()
         known: dict[str, list[str]] = json.loads(str(demos.attributes.get(DIMENSION_NAMES, "{}")))
-        self.names = {f"{key}[{n}]": f"{key} {name}" for key, names in known.items() for n, name in enumerate(names)}
+        self.names = {
+            f"{key}[{n}]": f"{key} {name}" for key, names in known.items() for n, name in enumerate(names)
+        }
         self.cameras, self.block = lru_cache(KEPT)(self._cameras), lru_cache(KEPT)(self._block)
         self.lock = Lock()
 
@@ -71,7 +73,12 @@ class Following:
             numbers = {**numbers, "names": [self.names.get(name, name) for name in numbers["names"]]}
         with self.lock:
             cameras = [*self.cameras(index)]
-        return {"numbers": numbers, "paths": found.get("paths"), "view": found.get("view"), "cameras": cameras}
+        return {
+            "numbers": numbers,
+            "paths": found.get("paths"),
+            "view": found.get("view"),
+            "cameras": cameras,
+        }
 
     def picture(self, index: int, camera: int, step: int) -> bytes:
         """The picture of a step as JPEG.

@@ -47,7 +47,8 @@ GONE = -9
 def weight(power: float) -> float:
     """γ of the recogniser's evidence beside controls that count β times: 3 β, at most 1.
 
-    It is about the ratio of the pairs that cross-validation tries (:data:`~ddco_pyro.training.recognition.PAIRS`).
+    It is about the ratio of the pairs that cross-validation tries
+    (:data:`~ddco_pyro.training.recognition.PAIRS`).
     """
     return min(1.0, 3 * power)
 
@@ -65,15 +66,23 @@ class Shown:
 
 
 def windows_of(
-    model: Hierarchy, count: int, typical: float, batches: Iterable[tuple[Sequence[str], Batch]], seen: Pictures
+    model: Hierarchy,
+    count: int,
+    typical: float,
+    batches: Iterable[tuple[Sequence[str], Batch]],
+    seen: Pictures,
 ) -> tuple[Windows, list[Tensor]]:
-    """A recogniser of so many options that has learned nothing yet, and what it reads, [N, T, 3 F] of each batch.
+    """A recogniser of so many options that has learned nothing yet, and what it reads, [N, T, 3 F] of each
+    batch.
 
     :param typical: the length of a segment.
     :param batches: with the names of their demonstrations.
     """
     size = next((rows.shape[1] for rows in seen.values()), 0)
-    windows, found = Windows(count, model.input_shape, len(model.scaling.varying), past=False, pictures=size), []
+    windows, found = (
+        Windows(count, model.input_shape, len(model.scaling.varying), past=False, pictures=size),
+        [],
+    )
     windows.widths.copy_(half_widths(typical))
     for names, batch in batches:
         read = batch.actions
@@ -99,13 +108,13 @@ class Learned:
 class Proposals:
     """The exact posterior of a level, with the named steps clamped and a recogniser's evidence of the others.
 
-    The model's options are numbered anew, as a person's: so that the model by itself agrees with the named steps, and
-    elsewhere with what was shown before. A path has the model's own numbers, so that a new numbering holds at once for
-    all demonstrations, whenever each of them is inferred.
+    The model's options are numbered anew, as a person's: so that the model by itself agrees with the named
+    steps, and elsewhere with what was shown before. A path has the model's own numbers, so that a new
+    numbering holds at once for all demonstrations, whenever each of them is inferred.
 
     :param level: 1 is the lowest.
-    :param labels: an option of the person for each step, [T], of every demonstration; below 1 where the model proposes.
-        An option that the model does not have yet clamps nothing.
+    :param labels: an option of the person for each step, [T], of every demonstration; below 1 where the model
+        proposes. An option that the model does not have yet clamps nothing.
     :param count: the options that a person can name.
     :param before: the person's option of each step [T] shown before; empty for the model's own numbers.
     :param seen: empty for none.
@@ -126,7 +135,9 @@ class Proposals:
         levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
         self.size = levels[level - 1].count
         self.pieces = list(fit.infer(demos))
-        self.place = {name: (piece, row) for piece, own in enumerate(self.pieces) for row, name in enumerate(own.names)}
+        self.place = {
+            name: (piece, row) for piece, own in enumerate(self.pieces) for row, name in enumerate(own.names)
+        }
         with torch.no_grad():
             self.alone = [piece.outputs.tables(piece.batch.actions) for piece in self.pieces]
         alone = [
@@ -135,7 +146,10 @@ class Proposals:
         ]
         self.alone_u = [piece.posterior.u[level - 1] for piece in alone]
         every_run = [
-            run for piece in alone for row in range(len(piece.names)) for run in runs(*piece.segmented(row)[level - 1])
+            run
+            for piece in alone
+            for row in range(len(piece.names))
+            for run in runs(*piece.segmented(row)[level - 1])
         ]
         self.occurring = {option for option, _, _ in every_run} - {0}
         typical = float(np.median([stop - start for _, start, stop in every_run]))
@@ -155,7 +169,10 @@ class Proposals:
             self.paths |= self.found(piece)
 
     def renumber(
-        self, labels: Mapping[str, np.ndarray], count: int, before: Mapping[str, np.ndarray] = MappingProxyType({})
+        self,
+        labels: Mapping[str, np.ndarray],
+        count: int,
+        before: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
         """Number the options anew, as the person has other ones; arguments as of the class."""
         self.usual = self._common(before, count) if before else np.eye(self.size, count)
@@ -165,9 +182,9 @@ class Proposals:
     def number(self, labels: Mapping[str, np.ndarray]) -> bool:
         """Number the options by the named steps: each is another option of the person where there are enough.
 
-        Options keep their numbers unless named steps are against it by more than half a segment of each. An option that
-        is newer than the model is none of them. An option of the model that is none of the person's is :data:`GONE`,
-        where the person has fewer.
+        Options keep their numbers unless named steps are against it by more than half a segment of each. An
+        option that is newer than the model is none of them. An option of the model that is none of the
+        person's is :data:`GONE`, where the person has fewer.
 
         :return: whether a number changed.
         """
@@ -219,9 +236,11 @@ class Proposals:
         return Learned(windows, unknown)
 
     def infer(self, names: Iterable[str], labels: Mapping[str, np.ndarray]) -> Iterator[Inferred]:
-        """The posterior of some demonstrations, a few at a time: named steps are clamped, the recogniser is evidence.
+        """The posterior of some demonstrations, a few at a time: named steps are clamped, the recogniser is
+        evidence.
 
-        The recogniser says nothing of steps that the model by itself gives to an option that is unknown to it.
+        The recogniser says nothing of steps that the model by itself gives to an option that is unknown to
+        it.
         """
         rows: dict[int, list[int]] = {}
         for name in names:
@@ -236,7 +255,9 @@ class Proposals:
                 leaves = [None if table is None else table[some, steps] for table in alone.leaves()]
                 tables = Tables.of(alone.depth, leaves, alone.power)
                 if self.learned.windows is not None:
-                    silent = torch.isin(self.alone_u[place][some, steps].argmax(-1), self.learned.unknown).unsqueeze(-1)
+                    silent = torch.isin(
+                        self.alone_u[place][some, steps].argmax(-1), self.learned.unknown
+                    ).unsqueeze(-1)
                     ratio = gamma * self.learned.windows.log_ratio(self.features[place][some, steps])
                     tables = tables.with_evidence(level, torch.where(silent, 0.0, ratio))
                 chosen = tuple(piece.names[row] for row in some.tolist())
@@ -299,7 +320,7 @@ class Proposals:
         return self.features[piece][row, : self.pieces[piece].lengths[row]]
 
 
-# --- segments to write ------------------------------------------------------------------------------------------------
+# --- segments to write --------------------------------------------------------------------------------------
 
 
 def labels_shown(document: Document, name: str, shown: Shown) -> LevelLabels:
@@ -315,7 +336,9 @@ def sources_shown(document: Document, name: str) -> np.ndarray:
     """The place in :data:`~ddco_pyro.data.labels.SOURCES` of who says what each step is, [T]."""
     labels = document.labels[name]
     said = np.where(document.given[name], SOURCES.index("given"), SOURCES.index("accepted"))
-    return np.select([labels == OPEN, labels == FREE], [SOURCES.index("open"), SOURCES.index("proposed")], said)
+    return np.select(
+        [labels == OPEN, labels == FREE], [SOURCES.index("open"), SOURCES.index("proposed")], said
+    )
 
 
 def said_segments(
@@ -350,8 +373,8 @@ def said_in(
 
     Labels that ``segment`` wrote say nothing: a model proposed them.
 
-    :param names: of the options 1 to k, as the run has them. A name that none of them has is given to one that has no
-        name of its own, or is new.
+    :param names: of the options 1 to k, as the run has them. A name that none of them has is given to one
+        that has no name of its own, or is new.
     :param lerobot: whether the labels are the subtasks of a LeRobot dataset.
     :param marked: whether marks of demonstrations are read, too.
     """
@@ -375,7 +398,9 @@ def said_in(
         options[value] = found.index(name) + 1
     for demo in demos:
         labels = demo.labels.get(level, np.full(len(demo), UNKNOWN))
-        sources = demo.labels.get(level + SOURCE, np.where(labels == UNKNOWN, UNKNOWN, SOURCES.index("given")))
+        sources = demo.labels.get(
+            level + SOURCE, np.where(labels == UNKNOWN, UNKNOWN, SOURCES.index("given"))
+        )
         edges = (np.diff(labels, prepend=-9) != 0) | (np.diff(sources, prepend=-9) != 0)
         for value, start, stop in runs(labels, edges):
             source = "proposed" if sources[start] == UNKNOWN else words[sources[start]]
@@ -409,7 +434,7 @@ def shown_segments(
     )
 
 
-# --- what is expected wrong -------------------------------------------------------------------------------------------
+# --- what is expected wrong ---------------------------------------------------------------------------------
 
 USUAL = 0.1
 """ε before anything is accepted: demonstrations that the posterior is sure of count, too."""
@@ -422,7 +447,9 @@ def first_wrong(first: Shown, accepted: Shown) -> tuple[float, int]:
     """
     found = agreement([first.options], [accepted.options])
     assert found is not None  # there are steps
-    return float((1 - first.probability).sum()), round((1 - found.matched_globally.accuracy) * len(first.options))
+    return float((1 - first.probability).sum()), round(
+        (1 - found.matched_globally.accuracy) * len(first.options)
+    )
 
 
 def excess(proposed: Shown, labels: np.ndarray) -> float:
@@ -431,16 +458,19 @@ def excess(proposed: Shown, labels: np.ndarray) -> float:
     :param labels: an option of each step, [T]; below 1 where none is named.
     """
     said = labels > 0
-    return float(((proposed.options != labels) - (1 - proposed.probability))[said].mean()) if said.any() else 0.0
+    return (
+        float(((proposed.options != labels) - (1 - proposed.probability))[said].mean()) if said.any() else 0.0
+    )
 
 
 def unforeseen(first: Sequence[float], held_out: Sequence[float]) -> float:
     """ε, the share of steps that are wrong although the posterior is sure of them.
 
-    It is the mean of what was in excess in demonstrations that were held out. The mean of all first proposals counts
-    as one more of these: it alone is known of a single demonstration.
+    It is the mean of what was in excess in demonstrations that were held out. The mean of all first proposals
+    counts as one more of these: it alone is known of a single demonstration.
 
-    :param first: of each accepted demonstration, :func:`excess` of what was shown before anything was said of it.
+    :param first: of each accepted demonstration, :func:`excess` of what was shown before anything was said of
+        it.
     :param held_out: the same of what the model says without its labels.
     """
     if not first:
@@ -449,7 +479,8 @@ def unforeseen(first: Sequence[float], held_out: Sequence[float]) -> float:
 
 
 def expected_wrong(shown: Shown, labels: np.ndarray, sure: float) -> float:
-    """The expected number of wrong steps of a demonstration, Σ (1 - p) + ε p over those of which nothing is said.
+    """The expected number of wrong steps of a demonstration, Σ (1 - p) + ε p over those of which nothing is
+    said.
 
     :param sure: ε, as :func:`unforeseen` gives it.
     """
@@ -460,12 +491,12 @@ def expected_wrong(shown: Shown, labels: np.ndarray, sure: float) -> float:
 def ranking(
     wrong: np.ndarray, edits: np.ndarray, centres: np.ndarray, accepted: np.ndarray
 ) -> tuple[list[int], int | None]:
-    """Demonstrations that are not accepted, the one most worth labelling first, then the others; and the least like
-    accepted ones, None where there are none.
+    """Demonstrations that are not accepted, the one most worth labelling first, then the others; and the
+    least like accepted ones, None where there are none.
 
-    Worth is the expected number of wrong steps for an edit, times the mean likeness to those that are not accepted,
-    times one minus the likeness to the nearest accepted one. Likeness is exp(-d²/2h²), of the distance d between mean
-    features, and h is the median of d.
+    Worth is the expected number of wrong steps for an edit, times the mean likeness to those that are not
+    accepted, times one minus the likeness to the nearest accepted one. Likeness is exp(-d²/2h²), of the
+    distance d between mean features, and h is the median of d.
 
     :param wrong: the expected number of wrong steps, [N].
     :param edits: the expected number of edits, [N].

@@ -46,12 +46,12 @@ def refit(
 ) -> Fit:
     """The model with so many options at a level, fitted to all demonstrations and to a person's labels.
 
-    Option h stands for label h. A level that EM trains, under a meta-policy alone, takes a few steps from the options
-    that a recogniser of the labelled steps finds. Other models are fitted as their spec says.
+    Option h stands for label h. A level that EM trains, under a meta-policy alone, takes a few steps from the
+    options that a recogniser of the labelled steps finds. Other models are fitted as their spec says.
 
     :param labels: an option of each step, [T], by demonstration; below 1 for none.
-    :param kept: the option that each step begins with whatever the recogniser finds, [T], by demonstration; below 1 for
-        none.
+    :param kept: the option that each step begins with whatever the recogniser finds, [T], by demonstration;
+        below 1 for none.
     :param seen: read by the recogniser of a single level that EM trains.
     """
     spec, before = refit_spec(trained, level, count), trained.hierarchy
@@ -68,7 +68,9 @@ def refit(
         named = Labels(1, tuple(range(1, count + 1)), names, known, known)
         data = TrainingData(spec, size, batch, batch, names, fitted_of(before), named)
         model = data.hierarchy(0)
-        windows, (features,) = windows_of(before, count, typical_length(known.numpy()), [(names, batch)], seen)
+        windows, (features,) = windows_of(
+            before, count, typical_length(known.numpy()), [(names, batch)], seen
+        )
         learn(windows, features[known > 0], known[known > 0], RIDGE)
         own = _padded([kept[name] for name in names])
         silent, alive = own > 0, torch.arange(known.shape[1]) < batch.lengths[:, None]
@@ -114,7 +116,9 @@ def refit_spec(trained: Fit, level: str, count: int) -> Spec:
         ridge = trained.metrics.training.raised_ridge or trained.spec.training.optimizer.ridge.policy
         known = {"policy": ridge, "cross_validated": False}
         changes["training.tune_fraction"] = 0.0  # the few labelled demonstrations are to be trained with
-        changes |= {"training.epochs": EPOCHS} | {f"training.optimizer.ridge.{key}": own for key, own in known.items()}
+        changes |= {"training.epochs": EPOCHS} | {
+            f"training.optimizer.ridge.{key}": own for key, own in known.items()
+        }
     return with_overrides(trained.spec, changes)
 
 

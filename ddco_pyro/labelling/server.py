@@ -1,6 +1,7 @@
 """The local web server of ``ddco-pyro label``: a :class:`Session` over HTTP, and the page that shows it.
 
-It listens on this machine alone. The first part of every path is a random token, and a foreign ``Host`` is refused.
+It listens on this machine alone. The first part of every path is a random token, and a foreign ``Host`` is
+refused.
 """
 
 from __future__ import annotations
@@ -72,7 +73,9 @@ class Listening:
         try:
             return cls(socket.create_server((LOOPBACK, port)))
         except (OSError, OverflowError) as error:
-            raise Failed(f"port {port}: {reason(OSError(*error.args))}; choose another one with --port") from error
+            raise Failed(
+                f"port {port}: {reason(OSError(*error.args))}; choose another one with --port"
+            ) from error
 
     @property
     def address(self) -> str:
@@ -127,7 +130,9 @@ def application(sessions: Sequence[Session], token: str) -> Starlette:
         return found
 
     async def refused(request: Request, error: Exception) -> Response:
-        status, text = (error.status_code, error.detail) if isinstance(error, HTTPException) else (500, reason(error))
+        status, text = (
+            (error.status_code, error.detail) if isinstance(error, HTTPException) else (500, reason(error))
+        )
         return JSONResponse({"error": text}, status)
 
     levels = [Mount(f"/level/{number}", routes=_answers(session)) for number, session in enumerate(sessions)]

@@ -72,7 +72,9 @@ def read(path: Path, needed: Iterable[str] = (), where: Where = NOTHING) -> Demo
     with open_source(path, where=where) as source:
         each = []
         for demo in map(source.read, source.names):
-            seen = {key: own for key, own in demo.observations.items() if key in needed or not is_picture(own)}
+            seen = {
+                key: own for key, own in demo.observations.items() if key in needed or not is_picture(own)
+            }
             each.append(Demonstration(demo.name, seen, demo.actions, demo.labels, demo.attributes))
         rate = {FREQUENCY: source.frequency} if source.frequency else {}
         return Demonstrations(tuple(each), source.masks, {**source.attributes, **rate})
@@ -81,7 +83,8 @@ def read(path: Path, needed: Iterable[str] = (), where: Where = NOTHING) -> Demo
 class Session:
     """Labels of one level of a run's options, which people correct.
 
-    Every method may be called from any thread. Steps are counted from 0, and ``stop`` is the step after the last.
+    Every method may be called from any thread. Steps are counted from 0, and ``stop`` is the step after the
+    last.
 
     :param fit: has options.
     :param path: an HDF5 file of demonstrations, or a LeRobot dataset.
@@ -91,9 +94,11 @@ class Session:
     :param team: who labels, and who labels what.
     :param first: the session of another level, whose demonstrations and marks are those of this one.
     :param where: attributes and values of the demonstrations to label; all if empty.
-    :param features: of pictures, which the recognisers of all levels read once they are computed; of the first session.
+    :param features: of pictures, which the recognisers of all levels read once they are computed; of the
+        first session.
     :ivar beside: the sessions of the other levels.
-    :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process labels it.
+    :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process
+        labels it.
     """
 
     proposals: Proposals
@@ -118,7 +123,9 @@ class Session:
         self.beside = list[Session]()
         self.demos: Demonstrations = first.demos if first else read(path, fit.hierarchy.encoder.shapes, where)
         if (tasks := fit.hierarchy.encoder.tasks) and not first:
-            self.demos = replace(self.demos, demonstrations=tuple(with_task(demo, tasks) for demo in self.demos))
+            self.demos = replace(
+                self.demos, demonstrations=tuple(with_task(demo, tasks) for demo in self.demos)
+            )
         self.form, self.in_place = format_of(path), out.exists() and out.samefile(path)
         self._check_out()
         self.files = [file for file in (path, *path.rglob("*")) if file.is_file()]
@@ -139,7 +146,9 @@ class Session:
         self.refits, self.again = 0, False
         self.features, self.seen = features, dict[str, np.ndarray]()
         self.encoding: Background = first.encoding if first else Background(self.lock, lambda: None)
-        self.background = Background(self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model")
+        self.background = Background(
+            self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model"
+        )
         self.shown, self.untouched, self.sure = dict[str, Shown](), dict[str, Shown](), 0.0
         self.view = View(self.document, self.shown, self.untouched)
         self.segments, self.recent = dict[str, list[Segment]](), dict[str, Inferred]()
@@ -179,7 +188,7 @@ class Session:
             self.document.done and not self.out.exists()
         )
 
-    # --- the model ----------------------------------------------------------------------------------------------------
+    # --- the model ------------------------------------------------------------------------------------------
 
     def _prepare(self, fit: Fit) -> Callable[[], None]:
         """Infer by another model; what is given shows its proposals.
@@ -236,8 +245,8 @@ class Session:
         self.proposals.paths |= self.proposals.found(piece)
         self.recent = {name: piece}
 
-    # Edits change what is learned, and with it all demonstrations. A thread learns and infers them anew, those first
-    # that wait longest. Another edit makes it begin with what that edit tells.
+    # Edits change what is learned, and with it all demonstrations. A thread learns and infers them anew,
+    # those first that wait longest. Another edit makes it begin with what that edit tells.
 
     def _catch_up(self, needed: bool = True) -> None:
         self.behind = self.behind or needed
@@ -306,12 +315,17 @@ class Session:
         self.uncertain = [{"demo": place, "step": step} for _, place, step in sorted(found)[:UNCERTAIN]]
         self.revision += 1
 
-    # --- what is shown ------------------------------------------------------------------------------------------------
+    # --- what is shown --------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """Everything but the demonstrations themselves."""
         with self.lock:
-            document, names, others, wrong = self.document, self.demos.names, self.journal.others(), self._wrong()
+            document, names, others, wrong = (
+                self.document,
+                self.demos.names,
+                self.journal.others(),
+                self._wrong(),
+            )
             demos = [
                 {
                     "name": name,
@@ -370,22 +384,25 @@ class Session:
     def _scratch(self) -> bool:
         """Whether a first demonstration likely takes fewer edits where names go from the cursor on.
 
-        That is so where most of the steps that a person named were proposed wrong. The posterior says nothing of it:
-        the model may be sure of segments that are none of the person's.
+        That is so where most of the steps that a person named were proposed wrong. The posterior says nothing
+        of it: the model may be sure of segments that are none of the person's.
         """
         labels = self.document.labels
         if self.document.accepted:
             return False
         named = {name: own > 0 for name, own in labels.items() if name in self.untouched}
-        wrong = sum(int((self.untouched[name].options != labels[name])[said].sum()) for name, said in named.items())
+        wrong = sum(
+            int((self.untouched[name].options != labels[name])[said].sum()) for name, said in named.items()
+        )
         total = sum(int(said.sum()) for said in named.values())
         return total * TENTH >= min(self.document.lengths.values()) and wrong > total / 2
 
     def progress(self) -> dict[str, Any]:
         """What changes by itself.
 
-        ``revision`` is larger after each change of what is shown. While it is ``behind``, edits have effects on other
-        demonstrations that are not shown yet. ``dirty`` says that the journal has labels that the file lacks.
+        ``revision`` is larger after each change of what is shown. While it is ``behind``, edits have effects
+        on other demonstrations that are not shown yet. ``dirty`` says that the journal has labels that the
+        file lacks.
         """
         with self.lock:
             return {
@@ -403,7 +420,8 @@ class Session:
             }
 
     def summary(self) -> dict[str, Any]:
-        """The expected share of wrong steps, how much of it is in the demonstration to label next, and labelled ones.
+        """The expected share of wrong steps, how much of it is in the demonstration to label next, and
+        labelled ones.
 
         Both shares are None before anything is accepted.
         """
@@ -419,8 +437,15 @@ class Session:
     def warnings(self) -> list[str]:
         """What a person should know: a changed file, a failure, demonstrations unlike those of the fit."""
         changed = f"{self.path} changed while it was labelled; start again to go on with it"
-        features = self.encoding.error and f"features of pictures: {self.encoding.error}; proposals go on without them"
-        return [*([] if self._unchanged() else [changed]), *filter(None, [self.error, features]), *self.unlike]
+        features = (
+            self.encoding.error
+            and f"features of pictures: {self.encoding.error}; proposals go on without them"
+        )
+        return [
+            *([] if self._unchanged() else [changed]),
+            *filter(None, [self.error, features]),
+            *self.unlike,
+        ]
 
     def _features_said(self) -> str:
         """How far features of pictures are, in words."""
@@ -491,7 +516,12 @@ class Session:
         labels, ours = own.labels[name], self.document.names
         colour = dict(zip(ours, self.colours, strict=True))
         segments = [
-            {"start": start, "stop": stop, "option": max(value, 0), "source": "open" if value < 0 else "given"}
+            {
+                "start": start,
+                "stop": stop,
+                "option": max(value, 0),
+                "source": "open" if value < 0 else "given",
+            }
             for value, start, stop in runs(labels, np.diff(labels, prepend=-9))
         ]
         return {
@@ -516,7 +546,9 @@ class Session:
         with self.lock:
             name = self._name(index)
             here, segments, proposals = self.view.at(name, step), dict(self.segments), self.proposals
-        centres = {other: proposals.centres(other, [one.start for one in own]) for other, own in segments.items()}
+        centres = {
+            other: proposals.centres(other, [one.start for one in own]) for other, own in segments.items()
+        }
         mine, found = centres[name][segments[name].index(here)], []
         for place, other in enumerate(self.demos.names):
             if other != name:
@@ -527,7 +559,7 @@ class Session:
             for _, place, own in heapq.nsmallest(NEAREST, found, key=itemgetter(0))
         ]
 
-    # --- what a person says -------------------------------------------------------------------------------------------
+    # --- what a person says ---------------------------------------------------------------------------------
 
     def edit(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Do what a person asks, on disk before this returns.
@@ -537,13 +569,19 @@ class Session:
         with self.lock:
             do, document = command.get("do"), self.document
             index = whole(command, "demo") if "demo" in command else None
-            name, names, shown = None if index is None else self._name(index), document.names, self._shown_now()
+            name, names, shown = (
+                None if index is None else self._name(index),
+                document.names,
+                self._shown_now(),
+            )
             if do == "mark" and self.first is not self:
                 return self.first.edit(command)
             if do in ("undo", "redo"):
                 self.journal.write(str(do))
             else:
-                asked = self._taken(name, command) if do == "take" else self.view.changes(str(do), name, command)
+                asked = (
+                    self._taken(name, command) if do == "take" else self.view.changes(str(do), name, command)
+                )
                 changes = list(filter(document.alters, asked))
                 if not changes:
                     return {"revision": self.revision, "demo": index, "done": False}
@@ -614,10 +652,11 @@ class Session:
         if names != known and len({*names}) == len(names):
             self.run.name_options(self.level, names)
 
-    # --- in the background --------------------------------------------------------------------------------------------
+    # --- in the background ----------------------------------------------------------------------------------
 
     def refit(self) -> None:
-        """Fit again in another process, with the labels and a recogniser of them; what comes of it is shown then.
+        """Fit again in another process, with the labels and a recogniser of them; what comes of it is shown
+        then.
 
         A refit that is asked for meanwhile begins when this one has ended.
         """
@@ -672,7 +711,10 @@ class Session:
         """The demonstrations with what the run's networks observe alone."""
         keys = self.run.hierarchy.encoder.shapes
         return Demonstrations(
-            tuple(replace(demo, observations={key: demo.observations[key] for key in keys}) for demo in self.demos),
+            tuple(
+                replace(demo, observations={key: demo.observations[key] for key in keys})
+                for demo in self.demos
+            ),
             attributes=self.demos.attributes,
         )
 
@@ -683,7 +725,7 @@ class Session:
             self.background.cancel()
             self.revision += 1
 
-    # --- files --------------------------------------------------------------------------------------------------------
+    # --- files ----------------------------------------------------------------------------------------------
 
     def save(self) -> str:
         """Write the labels of all levels and the marks, -1 where nothing is said, whole or not at all.
@@ -720,7 +762,11 @@ class Session:
     @property
     def formats(self) -> list[str]:
         """Those of ``segment`` that the page offers: all that take the demonstrations, without the copy with labels."""
-        return [option[2:] for option, form in FORMATS.items() if form.takes in ("", self.form) and option != "--out"]
+        return [
+            option[2:]
+            for option, form in FORMATS.items()
+            if form.takes in ("", self.form) and option != "--out"
+        ]
 
     def export(self, form: str, folder: Path) -> Path:
         """Write the shown segments in one of :attr:`formats` into a folder, without excluded demonstrations.
@@ -737,7 +783,9 @@ class Session:
                 segmented = shown_segments(self.fit, source, self.level, self.shown, self.document)
             marks, whole = self.first.document.marks, about.takes == "lerobot"
             kept = tuple(demo for demo in segmented.segments if whole or demo.name not in self.excluded)
-            self._write(f"--{form}", place, source, replace(segmented, segments=kept, marks=marks), self.level)
+            self._write(
+                f"--{form}", place, source, replace(segmented, segments=kept, marks=marks), self.level
+            )
         return place
 
     def close(self) -> None:
@@ -758,4 +806,9 @@ def _band(step: int, drawn: np.ndarray) -> dict[str, Any]:
     """A boundary with its 90 % interval and, within it, how often draws have each step, beside the most frequent."""
     low, high = within(drawn, step)
     often = np.bincount(drawn[(drawn >= low) & (drawn <= high)] - low, minlength=high - low + 1)
-    return {"step": step, "low": low, "high": high, "density": text(np.rint(255 * often / max(often.max(), 1)))}
+    return {
+        "step": step,
+        "low": low,
+        "high": high,
+        "density": text(np.rint(255 * often / max(often.max(), 1))),
+    }

@@ -37,7 +37,9 @@ class Team:
             if name and not name.replace("-", "").replace("_", "").isalnum():
                 raise BadInput(f"--annotator {name}: use letters, digits, - and _")
         if self.members and (self.me not in self.members or len({*self.members}) < len(self.members)):
-            raise BadInput(f"--team {','.join(self.members)}: name each annotator once, and yourself with --annotator")
+            raise BadInput(
+                f"--team {','.join(self.members)}: name each annotator once, and yourself with --annotator"
+            )
         if self.twice and len(self.members) < 2:
             raise BadInput("--twice: two annotators share demonstrations; name them with --team")
 
@@ -60,8 +62,8 @@ class Team:
 def agreement(mine: Document, theirs: Document, names: Sequence[str]) -> dict[str, Any] | None:
     """How two annotators agree on demonstrations; None where they said nothing of the same steps.
 
-    :returns: Cohen's κ (None where there is one name alone), F1 of boundaries within :data:`TOLERANCE`, and the share
-        of the steps that both said in which the names are the same.
+    :returns: Cohen's κ (None where there is one name alone), F1 of boundaries within :data:`TOLERANCE`, and
+        the share of the steps that both said in which the names are the same.
     """
     pairs = [(mine.in_file(name), theirs.in_file(name)) for name in names]
     known = [["", *mine.names], ["", *theirs.names]]
@@ -75,10 +77,13 @@ def taken(mine: Document, theirs: Document, name: str) -> list[Change]:
     """The changes that make one's labels of a demonstration those of another annotator, by names."""
     new = [text for text in theirs.names if text not in mine.names]
     names = [*mine.names, *new]
-    numbers = {FREE: FREE, OPEN: OPEN} | {n: names.index(text) + 1 for n, text in enumerate(theirs.names, start=1)}
+    numbers = {FREE: FREE, OPEN: OPEN} | {
+        n: names.index(text) + 1 for n, text in enumerate(theirs.names, start=1)
+    }
     labels = theirs.labels[name]
     painted = [
-        (PAINT, name, start, stop, numbers[value]) for value, start, stop in runs(labels, np.diff(labels, prepend=-9))
+        (PAINT, name, start, stop, numbers[value])
+        for value, start, stop in runs(labels, np.diff(labels, prepend=-9))
     ]
     cuts = [("cut", name, step, True) for step in sorted(theirs.cuts[name])]
     gone = [("cut", name, step, False) for step in sorted(mine.cuts[name] - theirs.cuts[name])]

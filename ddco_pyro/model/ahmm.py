@@ -1,7 +1,9 @@
-"""The abstract hidden Markov model of DDCO (paper §4.1, §4.2), for any number of option levels, as a Pyro program.
+"""The abstract hidden Markov model of DDCO (paper §4.1, §4.2), for any number of option levels, as a Pyro
+program.
 
-:mod:`ddco_pyro.model.tables` numbers the levels and their choices. The networks' outputs are given; the program draws
-the options and the control of the acting caller. The engines in :mod:`ddco_pyro.inference` eliminate its latents.
+:mod:`ddco_pyro.model.tables` numbers the levels and their choices. The networks' outputs are given; the
+program draws the options and the control of the acting caller. The engines in :mod:`ddco_pyro.inference`
+eliminate its latents.
 """
 
 from __future__ import annotations
@@ -26,8 +28,8 @@ from ddco_pyro.model.tables import NEVER, Chain
 class Tabulated(TorchDistribution):
     """A choice among C whose log-probabilities [..., C] are used as they stand.
 
-    Unlike ``Categorical`` it neither renormalises nor replaces -inf, so the gradient of a marginal likelihood with
-    respect to a table is the posterior probability of its entries.
+    Unlike ``Categorical`` it neither renormalises nor replaces -inf, so the gradient of a marginal likelihood
+    with respect to a table is the posterior probability of its entries.
     """
 
     arg_constraints: ClassVar = {"logits": constraints.real_vector}
@@ -53,7 +55,9 @@ class Tabulated(TorchDistribution):
         return values.expand((-1, *self.batch_shape)) if expand else values
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        return torch.distributions.Categorical(logits=self.logits, validate_args=False).sample(torch.Size(sample_shape))
+        return torch.distributions.Categorical(logits=self.logits, validate_args=False).sample(
+            torch.Size(sample_shape)
+        )
 
 
 @dataclass(frozen=True)
@@ -83,8 +87,8 @@ Steps = Emission | Scored
 class Acting(TorchDistribution):
     """The control of the acting caller: of the lowest level whose choice is not 0, else of the meta-policy.
 
-    :param emissions: of each level's options at one step, lowest first, the meta-policy's last, [N, K, A]; None for
-        callers that emit no control. The lowest level's callers always do.
+    :param emissions: of each level's options at one step, lowest first, the meta-policy's last, [N, K, A];
+        None for callers that emit no control. The lowest level's callers always do.
     :param choices: (h^1, ..., h^D), each [..., N].
     """
 
@@ -100,7 +104,9 @@ class Acting(TorchDistribution):
         super().__init__(torch.Size(shape), torch.Size([size]), validate_args=validate_args)
 
     def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> Acting:
-        return Acting(self.emissions, tuple(choice.expand(batch_shape) for choice in self.choices), validate_args=False)
+        return Acting(
+            self.emissions, tuple(choice.expand(batch_shape) for choice in self.choices), validate_args=False
+        )
 
     def log_prob(self, value: Tensor) -> Tensor:
         """log π(a | s) of the acting caller; -inf for impossible joint choices."""
@@ -134,7 +140,9 @@ class Acting(TorchDistribution):
     @property
     def mode(self) -> Tensor:
         """The most likely control of the acting caller, [..., N, A] in scaled units."""
-        return self._of_actor([None if emission is None else emission.mode for emission in self.emissions], torch.nan)
+        return self._of_actor(
+            [None if emission is None else emission.mode for emission in self.emissions], torch.nan
+        )
 
     def _of_actor(self, values: Sequence[Tensor | None], missing: float) -> Tensor:
         """The acting caller's part [..., N, E] of values [..., N, K, E] of each level's callers."""
@@ -189,13 +197,14 @@ def _terminate(t: int, now: Chain, previous: tuple[Tensor, ...], rows: Tensor) -
 def ahmm(chain: Chain, emissions: Sequence[Steps | None], actions: Tensor | None = None) -> None:
     """The joint probability p(ζ, ξ) of latents and controls of §4.1, without the dynamics p(s' | s, a).
 
-    The log-density of controls counts β times, the chain's ``power``: a coarsened posterior (Miller and Dunson 2019).
+    The log-density of controls counts β times, the chain's ``power``: a coarsened posterior (Miller and
+    Dunson 2019).
 
     Sample sites ``b_{d}_{t}``, ``h_{d}_{t}`` [N] and ``a_{t}`` [N, A], the control in scaled units.
 
     :param chain: the log-probabilities of selections and terminations; the controls' are not used.
-    :param emissions: how the callers of each level emit the control, [N, T, K, A], lowest first, the meta-policy's
-        last; None for a level whose callers emit none.
+    :param emissions: how the callers of each level emit the control, [N, T, K, A], lowest first, the
+        meta-policy's last; None for a level whose callers emit none.
     :param actions: the controls that were applied, [N, T, A]; without them controls are drawn.
     """
     with pyro.plate("demonstrations", len(chain.alive), dim=-1):
@@ -206,7 +215,9 @@ def run(chain: Chain, emissions: Sequence[Steps | None], actions: Tensor | None 
     """The program of :func:`ahmm` outside its plate over demonstrations."""
     steps = chain.steps()
     nothing: list[None] = [None] * len(steps)
-    emitting = list(zip(*(nothing if emission is None else emission.steps() for emission in emissions), strict=True))
+    emitting = list(
+        zip(*(nothing if emission is None else emission.steps() for emission in emissions), strict=True)
+    )
     applied = nothing if actions is None else actions.unbind(1)
     choices: tuple[Tensor, ...] | None = None
     for t in pyro.markov(range(len(steps))):

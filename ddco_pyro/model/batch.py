@@ -16,12 +16,13 @@ from ddco_pyro.model.networks import Inputs
 
 STEPS_AT_ONCE = 8192
 """Most steps of a piece of a batch; fewer where a step takes much memory
-(:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`). Memory stays bounded, and what the networks compute stays
-in the cache: with MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time in one piece."""
+(:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`). Memory stays bounded, and what the networks
+compute stays in the cache: with MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time in
+one piece."""
 
 LARGEST_SCALED = 1e12
-"""Largest feature or control in scaled units. The squares of what networks make of it, divided by that of a small σ,
-have to be float32 numbers, and those end at 3e38."""
+"""Largest feature or control in scaled units. The squares of what networks make of it, divided by that of a
+small σ, have to be float32 numbers, and those end at 3e38."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,8 @@ def refuse_unusable(
     """Check that networks can take every feature, and the emissions every control.
 
     :param fitted: whether the model is fitted, so that its kinds of controls stand.
-    :raises DemonstrationsError: a number in scaled units is larger than :data:`LARGEST_SCALED`, or a switch or a
-        discrete action has a value of probability 0.
+    :raises DemonstrationsError: a number in scaled units is larger than :data:`LARGEST_SCALED`, or a switch
+        or a discrete action has a value of probability 0.
     """
     places = np.repeat([f"obs/{name}" for name in encoder.keys], encoder.sizes)
     for demo in demonstrations:

@@ -24,11 +24,12 @@ INITIAL_STD = 0.5
 
 
 class ControlScaling(nn.Module):
-    """The map between a control [A] in its own units and the A' dimensions of it in the model, in scaled units.
+    """The map between a control [A] in its own units and the A' dimensions of it in the model, in scaled
+    units.
 
-    A continuous dimension is z = (a - shift) / scale, a switch 0 or 1, a discrete action its index. A hurdle is 0 at
-    its value and nowhere else; its spread is that of the other steps. Constant dimensions are outside the model.
-    Constant values, bounds, and the values of switches and hurdles are emitted exactly.
+    A continuous dimension is z = (a - shift) / scale, a switch 0 or 1, a discrete action its index. A hurdle
+    is 0 at its value and nowhere else; its spread is that of the other steps. Constant dimensions are outside
+    the model. Constant values, bounds, and the values of switches and hurdles are emitted exactly.
 
     With ``control.relative_to`` a control is relative to an observation wherever it is scaled.
 
@@ -58,7 +59,12 @@ class ControlScaling(nn.Module):
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
         count = len(varying)
-        shift, scale, low, high = np.zeros(count), np.ones(count), np.full(count, -math.inf), np.full(count, math.inf)
+        shift, scale, low, high = (
+            np.zeros(count),
+            np.ones(count),
+            np.full(count, -math.inf),
+            np.full(count, math.inf),
+        )
         for dims, part in zip(self.groups, parts, strict=True):
             places = list(dims)
             if part.low:
@@ -69,9 +75,13 @@ class ControlScaling(nn.Module):
                 shift[places], scale[places] = low[places], high[places] - low[places]
         order = np.argsort([*varying, *sorted(constant)]).tolist()  # Tensor.argsort on "meta" imports sympy
         for name, values in (("shift", shift), ("scale", scale), ("low", low), ("high", high)):
-            self.register_buffer(name, torch.tensor(values.tolist(), dtype=torch.float64), name in ("shift", "scale"))
+            self.register_buffer(
+                name, torch.tensor(values.tolist(), dtype=torch.float64), name in ("shift", "scale")
+            )
         self.register_buffer("varying", torch.tensor(varying, dtype=torch.int64))
-        self.register_buffer("constant", torch.tensor([constant[d] for d in sorted(constant)], dtype=torch.float64))
+        self.register_buffer(
+            "constant", torch.tensor([constant[d] for d in sorted(constant)], dtype=torch.float64)
+        )
         self.register_buffer("order", torch.tensor(order), persistent=False)
 
     @property
@@ -178,13 +188,14 @@ def raw_of(std: Tensor, floor: Tensor) -> Tensor:
 
 
 class ControlStd(nn.Module):
-    """The standard deviations σ of a caller's continuous dimensions, in scaled units: fixed, or learned above a floor.
+    """The standard deviations σ of a caller's continuous dimensions, in scaled units: fixed, or learned above
+    a floor.
 
     Those of one part come after those of the other.
 
-    The options of a level share a σ unless the spec says ``per_option``: with its own σ an option can collect the steps
-    where a Gaussian control hardly varies, as on a bound, whatever the skill (docs/decisions.md). With ``per_state``
-    σ = floor + softplus(y + start), where y is a number of the caller's network.
+    The options of a level share a σ unless the spec says ``per_option``: with its own σ an option can collect
+    the steps where a Gaussian control hardly varies, as on a bound, whatever the skill (docs/decisions.md).
+    With ``per_state`` σ = floor + softplus(y + start), where y is a number of the caller's network.
 
     :ivar of_state: the dimensions whose σ depends on the state.
     """

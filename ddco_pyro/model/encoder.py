@@ -23,22 +23,22 @@ NARROWEST = 1e-6
 
 
 class ObservationEncoder(nn.Module):
-    """Observations by name to one feature vector: angles and quaternions turned into numbers that do not jump,
-    differences appended, standardised.
+    """Observations by name to one feature vector: angles and quaternions turned into numbers that do not
+    jump, differences appended, standardised.
 
-    Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the model. A
-    dimension that varies by rounding alone (:func:`~ddco_pyro.data.controls.rounding`) is only centred, and so are
-    differences whose dimension does so within each demonstration. What moves later moves in its own units, not in
-    multiples of a rounding.
+    Mean and standard deviation are those of the demonstrations given to :meth:`fit`, and are kept with the
+    model. A dimension that varies by rounding alone (:func:`~ddco_pyro.data.controls.rounding`) is only
+    centred, and so are differences whose dimension does so within each demonstration. What moves later moves
+    in its own units, not in multiples of a rounding.
 
-    ``bins`` add, for a number x, min(max(x, q_k), q_{k+1}) between each two neighbouring quantiles q of its distinct
-    values, standardised as x is. This is a piecewise-linear encoding (Gorishniy, Rubachev and Babenko, On embeddings
-    for numerical features in tabular deep learning, 2022).
+    ``bins`` add, for a number x, min(max(x, q_k), q_{k+1}) between each two neighbouring quantiles q of its
+    distinct values, standardised as x is. This is a piecewise-linear encoding (Gorishniy, Rubachev and
+    Babenko, On embeddings for numerical features in tabular deep learning, 2022).
 
     Pictures are cropped and scaled as the spec says when they are read, from a file or from memory.
 
-    The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by ``longest``,
-    the steps of the longest demonstration given to :meth:`fit`.
+    The built-in observation :data:`~ddco_pyro.spec.STEP` is made here: the number of the step divided by
+    ``longest``, the steps of the longest demonstration given to :meth:`fit`.
 
     :param tasks: of the numbers of the built-in observation :data:`~ddco_pyro.spec.TASK`, in their order.
     :raises ShapeError: an observation cannot be read, cropped, scaled, binned or shifted as the spec says.
@@ -55,7 +55,9 @@ class ObservationEncoder(nn.Module):
         super().__init__()
         self.tasks = tuple(tasks)
         shapes = {**shapes, STEP: (1,)}
-        read = dict.fromkeys(key for spec in specs for key in (spec.key, spec.minus) if key not in (None, STEP))
+        read = dict.fromkeys(
+            key for spec in specs for key in (spec.key, spec.minus) if key not in (None, STEP)
+        )
         self.shapes = {key: tuple(shapes[key]) for key in read}
         kinds = {}
         for spec in specs:
@@ -114,7 +116,9 @@ class ObservationEncoder(nn.Module):
         """The feature of :meth:`features` behind each number that networks see, [F']: a key's own, then its bins'."""
         firsts = np.cumsum([0, *self.given])
         rows = zip(self.specs, firsts, self.given, strict=False)
-        return np.concatenate([np.tile(np.arange(first, first + count), 1 + spec.bins) for spec, first, count in rows])
+        return np.concatenate(
+            [np.tile(np.arange(first, first + count), 1 + spec.bins) for spec, first, count in rows]
+        )
 
     def _fit_bins(self, rows: np.ndarray) -> None:
         """Take the ends of each bin from ``rows`` [T, F]: quantiles of the distinct values.
@@ -186,7 +190,9 @@ class ObservationEncoder(nn.Module):
         # A split into nothing cannot be read again from an exported program.
         return dict(zip(self.keys, vector.split(self.sizes, -1), strict=True)) if self.sizes else {}
 
-    def inputs(self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None) -> Inputs:
+    def inputs(
+        self, observations: Iterable[Mapping[str, Observed]], times: np.ndarray | None = None
+    ) -> Inputs:
         """Sequences of observations, each [T_n, ...] by name, to padded network inputs.
 
         Pictures are read when a network asks for them.
@@ -221,14 +227,19 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     stored = shapes[spec.key]
     if spec.bins and len(stored) == PICTURE_DIMENSIONS:
         raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")
-    size, last = int(np.prod(stored)), max([*spec.angles, *(first + 3 for first in spec.quaternions)], default=-1)
+    size, last = (
+        int(np.prod(stored)),
+        max([*spec.angles, *(first + 3 for first in spec.quaternions)], default=-1),
+    )
     if last >= 0 and (len(stored) == PICTURE_DIMENSIONS or last >= size):
         raise ShapeError(
             f"observations: {spec.key!r} has shape {list(stored)} at each step: angles and quaternions name numbers of "
             f"a vector, counted from 0, and there is no number {last}"
         )
     if spec.shift and len(stored) != PICTURE_DIMENSIONS:
-        raise ShapeError(f"observations: {spec.key!r} has shape {list(stored)} at each step: shift is for pictures")
+        raise ShapeError(
+            f"observations: {spec.key!r} has shape {list(stored)} at each step: shift is for pictures"
+        )
     try:
         return Transform(spec.crop, spec.resize).shape(stored)
     except TransformError as error:

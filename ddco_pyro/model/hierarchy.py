@@ -1,4 +1,5 @@
-"""The networks of a hierarchy and the tables that they give: levels of options under a meta-policy (paper §4).
+"""The networks of a hierarchy and the tables that they give: levels of options under a meta-policy (paper
+§4).
 
 A flat policy is a hierarchy without option levels, whose meta-policy emits the control.
 """
@@ -49,16 +50,16 @@ TRUNK = "trunk"
 """The name of the trunk, and of its features as a vector that the other networks read."""
 
 RawOutputs = Sequence[Tensor]
-"""The outputs of networks [N, T, K, F]: policy and, where it has one, termination of each level, lowest first, and the
-meta-policy's."""
+"""The outputs of networks [N, T, K, F]: policy and, where it has one, termination of each level, lowest
+first, and the meta-policy's."""
 
 
 @dataclass(frozen=True)
 class Dimensions:
     """Shapes of the observations by name, control dimensions A, and steps of the longest demonstration.
 
-    :param constant: control dimensions that are constant in all demonstrations, with their values; the model leaves
-        them out.
+    :param constant: control dimensions that are constant in all demonstrations, with their values; the model
+        leaves them out.
     :param control: statistics of each control dimension in the demonstrations; empty where they are unknown.
     :param parts: the parts of the control in a fitted model; None before they are decided.
     :param tasks: of the numbers of the built-in observation ``task``.
@@ -91,7 +92,8 @@ class Dimensions:
         """With the kinds of control of a fitted model, which is to be the prior of another one.
 
         :param name: of the model, for errors.
-        :raises DemonstrationsError: observations or the control have other shapes, or a dimension varies here alone.
+        :raises DemonstrationsError: observations or the control have other shapes, or a dimension varies here
+            alone.
         """
         there = model.dimensions
         sizes = {f"obs/{key}": (tuple(self.shapes[key]), shape) for key, shape in there.shapes.items()}
@@ -108,8 +110,8 @@ class Dimensions:
 class Caller(nn.Module):
     """K policies over the options of the level below, the physical control, or both (§4.2).
 
-    The outputs of their network are the log-probabilities y_0 (control), y_1, ..., y_k, then the numbers of the
-    control, then y of every σ that depends on the state.
+    The outputs of their network are the log-probabilities y_0 (control), y_1, ..., y_k, then the numbers of
+    the control, then y of every σ that depends on the state.
     """
 
     def __init__(
@@ -178,7 +180,9 @@ class Hierarchy(nn.Module):
         size, constant, steps = dimensions.control_size, dimensions.constant, dimensions.steps
         self.steps, self.device = steps, HOST
         self.encoder = ObservationEncoder(spec.observations, dimensions.shapes, dimensions.tasks)
-        power = spec.control.power if spec.hierarchy is not None else 1.0  # nothing is latent in a flat policy
+        power = (
+            spec.control.power if spec.hierarchy is not None else 1.0
+        )  # nothing is latent in a flat policy
         self.register_buffer("power", torch.tensor(power, dtype=torch.float64))
         parts = dimensions.parts
         if parts is None and dimensions.control:
@@ -202,7 +206,9 @@ class Hierarchy(nn.Module):
         self.recogniser: Recogniser | None = None
         if spec.hierarchy is not None and (labels := spec.training.labels) is not None and labels.recogniser:
             place = 1 + [each.name for each in spec.hierarchy.levels].index(labels.level)
-            self.recogniser = Recogniser(place, levels[place - 1].count, self.input_shape, len(scaling.varying))
+            self.recogniser = Recogniser(
+                place, levels[place - 1].count, self.input_shape, len(scaling.varying)
+            )
 
     def place(self, device: torch.device) -> Hierarchy:
         """Move the networks, and nothing else, to a device. Their callers give and get tensors on the host."""
@@ -220,7 +226,9 @@ class Hierarchy(nn.Module):
 
     def named_callers(self) -> dict[str, Caller]:
         """The policies of each level, lowest first, and the meta-policy, by place as in :meth:`networks`."""
-        levels = {f"levels.{number}.policy": level.policy for number, level in enumerate(self.option_levels())}
+        levels = {
+            f"levels.{number}.policy": level.policy for number, level in enumerate(self.option_levels())
+        }
         return levels | {"meta_policy": self.meta_policy}
 
     def option_levels(self) -> list[Level]:
@@ -244,7 +252,11 @@ class Hierarchy(nn.Module):
     @property
     def read_shape(self) -> InputShape:
         """The shapes of what all networks but the trunk read: the observations, or the trunk's features."""
-        return self.input_shape if self.trunk is None else InputShape({TRUNK: self.trunk.features}, {}, self.steps)
+        return (
+            self.input_shape
+            if self.trunk is None
+            else InputShape({TRUNK: self.trunk.features}, {}, self.steps)
+        )
 
     @cached_property
     def step_bytes(self) -> int:
@@ -279,10 +291,12 @@ class Hierarchy(nn.Module):
     def forward(self, inputs: Inputs, discovering: int | None = None) -> Outputs:
         """The outputs for these observations, which begin with the first step of their trajectories.
 
-        Trajectories longer than :attr:`steps_in_memory` go through the networks in chunks of time. Only the raw outputs
-        and the states between chunks are kept; for the gradient each chunk is computed again, the last first.
+        Trajectories longer than :attr:`steps_in_memory` go through the networks in chunks of time. Only the
+        raw outputs and the states between chunks are kept; for the gradient each chunk is computed again, the
+        last first.
 
-        :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM 2.3).
+        :param discovering: d gives levels 1 to d alone under a uniform meta-policy (layer-wise training, SM
+            2.3).
         """
         chunks = list(inputs.chunks(self.steps_in_memory // inputs.batch[0]))
         if len(chunks) == 1:
@@ -291,12 +305,15 @@ class Hierarchy(nn.Module):
         states: States | None = None
         there = torch.empty(0, device=self.device)  # checkpoint draws again the random numbers of this device
         for chunk in chunks:
-            raw, states = checkpoint(self._run_networks, chunk, states, discovering, there, use_reentrant=False)
+            raw, states = checkpoint(
+                self._run_networks, chunk, states, discovering, there, use_reentrant=False
+            )
             each.append(raw)
         return self._outputs([torch.cat(parts, dim=1) for parts in zip(*each, strict=True)], discovering)
 
     def advance(self, inputs: Inputs, states: States | None) -> tuple[Outputs, dict[str, State]]:
-        """The outputs for these observations, and the networks' states after them, by :meth:`networks`' names.
+        """The outputs for these observations, and the networks' states after them, by :meth:`networks`'
+        names.
 
         :param states: after the observations before; None at the first step.
         """

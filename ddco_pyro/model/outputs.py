@@ -26,8 +26,8 @@ class CallerOutputs:
     """The outputs of the K callers of one level.
 
     :param options: k, the number of options that they select among; 0 for the lowest level.
-    :param logits: of their choices [N, T, K, k], or [N, T, K, 1 + k] with control (choice 0) first; None for callers
-        that only emit control.
+    :param logits: of their choices [N, T, K, k], or [N, T, K, 1 + k] with control (choice 0) first; None for
+        callers that only emit control.
     :param emission: the distribution of their control, [N, T, K, A]; None for callers that emit none.
     :param numbers: the network's numbers behind the emission, [N, T, K, size].
     """
@@ -78,8 +78,8 @@ class Outputs:
     """The outputs of all networks for a batch, before any control is known.
 
     :param callers: each level's, lowest first, the meta-policy's last.
-    :param termination_logits: of each level's options [N, T, k], before they are bounded; None for a level whose
-        options end after every step.
+    :param termination_logits: of each level's options [N, T, k], before they are bounded; None for a level
+        whose options end after every step.
     :param power: β of :class:`~ddco_pyro.model.tables.Tables`, a number.
     """
 

@@ -25,9 +25,9 @@ FRAMES_AT_ONCE = 64
 class Windows(nn.Module):
     """Multinomial logistic regression r(h | window) of the option of a step.
 
-    The features of step t are x_t and the means of x over the steps t - w to t + w, for two widths w. x_t is the
-    encoded observation, the block means of pictures, and the scaled control. A regression on the past has the control
-    before the step, 0 at the first one, and means over the steps t - w to t.
+    The features of step t are x_t and the means of x over the steps t - w to t + w, for two widths w. x_t is
+    the encoded observation, the block means of pictures, and the scaled control. A regression on the past has
+    the control before the step, 0 at the first one, and means over the steps t - w to t.
 
     :param options: k, the options of the level.
     :param shape: of the observations.
@@ -46,9 +46,15 @@ class Windows(nn.Module):
     def __init__(self, options: int, shape: InputShape, controls: int, past: bool, pictures: int = 0) -> None:
         super().__init__()
         self.past = past
-        size = shape.vector + sum(image[-1] * POOLED**2 for image in shape.images.values()) + controls + pictures
+        size = (
+            shape.vector + sum(image[-1] * POOLED**2 for image in shape.images.values()) + controls + pictures
+        )
         self.alike = torch.arange(size).ge(size - pictures).repeat(1 + SCALES)
-        for name, shaped in (("weight", ((1 + SCALES) * size, options)), ("bias", (options,)), ("share", (options,))):
+        for name, shaped in (
+            ("weight", ((1 + SCALES) * size, options)),
+            ("bias", (options,)),
+            ("share", (options,)),
+        ):
             self.register_buffer(name, torch.zeros(shaped, dtype=torch.float64))
         self.register_buffer("widths", torch.ones(SCALES, dtype=torch.int64))
 
@@ -62,11 +68,15 @@ class Windows(nn.Module):
             actions = pad(actions[:, :-1], (0, 0, 1, 0))
         x = torch.cat([observed(inputs), actions.double()], dim=-1)
         widths = self.widths.tolist()
-        return torch.cat([x, *(window_means(x, lengths, width, 0 if self.past else width) for width in widths)], dim=-1)
+        return torch.cat(
+            [x, *(window_means(x, lengths, width, 0 if self.past else width) for width in widths)], dim=-1
+        )
 
     def latest(self, rows: Sequence[Tensor]) -> Tensor:
         """The features [3 F] of the last of consecutive steps, from x of each [F]; for a regression on the past."""
-        return torch.cat([rows[-1], *(torch.stack([*rows[-1 - width :]]).mean(0) for width in self.widths.tolist())])
+        return torch.cat(
+            [rows[-1], *(torch.stack([*rows[-1 - width :]]).mean(0) for width in self.widths.tolist())]
+        )
 
     def log_probability(self, features: Tensor) -> Tensor:
         """log r(h | window), [..., k]; -inf for an option without labelled steps."""
@@ -76,7 +86,8 @@ class Windows(nn.Module):
     def log_ratio(self, features: Tensor) -> Tensor:
         """log r(h | window) - log p(h) of each choice, [..., 1 + k], p being the share of labelled steps.
 
-        log r is at least :data:`FLOOR`. Of control and of options without labelled steps the windows say nothing: 0.
+        log r is at least :data:`FLOOR`. Of control and of options without labelled steps the windows say
+        nothing: 0.
         """
         ratio = self.log_probability(features).clamp(min=FLOOR) - self.share.log()
         return pad(torch.where(self.share > 0, ratio, 0.0), (1, 0))
@@ -96,7 +107,8 @@ def window_means(x: Tensor, lengths: Tensor, before: int, after: int) -> Tensor:
 
 
 class Recogniser(nn.Module):
-    """What windows say of the options of a level, as evidence γ (log r(h | window) - log p(h)) of each choice.
+    """What windows say of the options of a level, as evidence γ (log r(h | window) - log p(h)) of each
+    choice.
 
     :param level: 1 is the lowest.
     :ivar around: sees the steps before and after a step.
@@ -115,7 +127,9 @@ class Recogniser(nn.Module):
 
     def evidence(self, batch: Batch) -> Tensor:
         """The evidence of each choice at every step, [N, T, 1 + k]."""
-        return self.gamma * self.around.log_ratio(self.around.features(batch.inputs, batch.actions, batch.lengths))
+        return self.gamma * self.around.log_ratio(
+            self.around.features(batch.inputs, batch.actions, batch.lengths)
+        )
 
     def options(self, batch: Batch) -> Tensor:
         """The likeliest option of every step by itself, 1 to k, [N, T]; arbitrary past a trajectory's end."""

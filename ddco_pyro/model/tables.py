@@ -1,8 +1,9 @@
-"""The log-probabilities of an AHMM as arrays, from which the engines in :mod:`ddco_pyro.inference` eliminate latents.
+"""The log-probabilities of an AHMM as arrays, from which the engines in :mod:`ddco_pyro.inference` eliminate
+latents.
 
-Level 1 is the lowest, level D the highest option level; the meta-policy calls level D. At each step every level d
-has a choice h^d in {0, 1, ..., k_d}: options are 1 to k_d, and choice 0 is *control*: the caller emits the physical
-control itself, for this step. Below a choice 0 every lower choice is 0 too.
+Level 1 is the lowest, level D the highest option level; the meta-policy calls level D. At each step every
+level d has a choice h^d in {0, 1, ..., k_d}: options are 1 to k_d, and choice 0 is *control*: the caller
+emits the physical control itself, for this step. Below a choice 0 every lower choice is 0 too.
 
 :class:`Tables` holds what the networks give; :class:`Chain` adds what the model fixes: choice 0 and padding.
 """
@@ -25,17 +26,19 @@ NEVER = -torch.inf
 class Tables:
     """Every log-probability the networks give for N trajectories of at most T steps.
 
-    Tuples run over the levels, lowest first. K_d is the number of callers of level d: the k_{d+1} options of the
-    level above, or 1 (the meta-policy) for the highest level.
+    Tuples run over the levels, lowest first. K_d is the number of callers of level d: the k_{d+1} options of
+    the level above, or 1 (the meta-policy) for the highest level.
 
-    :param selection: log η^{d+1}(h^d | s_t, h^{d+1}), shapes [N, T, K_d, 1 + k_d]; the first choice is control.
+    :param selection: log η^{d+1}(h^d | s_t, h^{d+1}), shapes [N, T, K_d, 1 + k_d]; the first choice is
+        control.
     :param termination: (log(1 - ψ^d(s_t)), log ψ^d(s_t)), shapes [N, T, k_d, 2]; unused at t = 0.
-    :param control: log π(a_t | s_t) of each level's options and, last, of the meta-policy, shapes [N, T, k_d] and
-        [N, T, 1]; -inf for callers that emit no control; empty where no control is known.
-    :param evidence: log-likelihood of each choice by other evidence, shapes [N, T, 1 + k_d]; None for a level without.
-        Hard labels are 0 and -inf.
+    :param control: log π(a_t | s_t) of each level's options and, last, of the meta-policy, shapes [N, T, k_d]
+        and [N, T, 1]; -inf for callers that emit no control; empty where no control is known.
+    :param evidence: log-likelihood of each choice by other evidence, shapes [N, T, 1 + k_d]; None for a level
+        without. Hard labels are 0 and -inf.
     :param power: β, how many times the log-density of each control counts in posteriors.
-    :param logits: whether selections and terminations are logits, whose softmax over the last dimension is meant.
+    :param logits: whether selections and terminations are logits, whose softmax over the last dimension is
+        meant.
     """
 
     selection: tuple[Tensor, ...]
@@ -61,11 +64,15 @@ class Tables:
         return int((self.selection or self.control)[-1].shape[1])
 
     @classmethod
-    def of(cls, depth: int, leaves: Sequence[Tensor | None], power: float = 1.0, logits: bool = False) -> Tables:
+    def of(
+        cls, depth: int, leaves: Sequence[Tensor | None], power: float = 1.0, logits: bool = False
+    ) -> Tables:
         """The tables of a hierarchy of ``depth`` levels from their :meth:`leaves`."""
         selection, termination = leaves[:depth], leaves[depth : 2 * depth]
         control, evidence = leaves[2 * depth : 3 * depth + 1], leaves[3 * depth + 1 :]
-        return cls(_present(selection), _present(termination), _present(control), tuple(evidence), power, logits)
+        return cls(
+            _present(selection), _present(termination), _present(control), tuple(evidence), power, logits
+        )
 
     def normalised(self) -> Tables:
         """These tables with log-probabilities in place of logits."""
@@ -74,7 +81,10 @@ class Tables:
         ratios = (table[..., 1] - table[..., 0] for table in self.termination)
         termination = (logsigmoid(torch.stack([-ratio, ratio], -1)) for ratio in ratios)
         return replace(
-            self, selection=tuple(map(normalised, self.selection)), termination=tuple(termination), logits=False
+            self,
+            selection=tuple(map(normalised, self.selection)),
+            termination=tuple(termination),
+            logits=False,
         )
 
     def leaves(self) -> tuple[Tensor | None, ...]:
@@ -86,7 +96,9 @@ class Tables:
         total: Tensor | None = None
         for level, evidence in enumerate(self.evidence, start=1):
             if evidence is not None:
-                shape = evidence.shape[:2] + (1,) * (self.depth - level) + evidence.shape[2:] + (1,) * (level - 1)
+                shape = (
+                    evidence.shape[:2] + (1,) * (self.depth - level) + evidence.shape[2:] + (1,) * (level - 1)
+                )
                 own = evidence.double().reshape(shape)
                 total = own if total is None else total + own
         return None if total is None else total.expand(*total.shape[:2], *reversed(self.sizes))
@@ -165,7 +177,8 @@ class Chain:
     :param selection: log-probability of choosing h^d given the caller h^{d+1}, shapes [N, T, C_{d+1}, C_d];
         the highest level's has one caller.
     :param termination: log-probabilities of b^d = 0 and 1 given h^d, shapes [N, T, C_d, 2].
-    :param evidence: log-likelihood of the joint choice by other evidence, [N, T, C_D, ..., C_1]; None for none.
+    :param evidence: log-likelihood of the joint choice by other evidence, [N, T, C_D, ..., C_1]; None for
+        none.
     :param emission: β times the log-density of the control given the joint choice, and the evidence,
         [N, T, C_D, ..., C_1]; None where no control is known.
     :param alive: whether a step is within its trajectory's length, [N, T].
@@ -195,7 +208,13 @@ class Chain:
         evidence = nothing if self.evidence is None else self.evidence.unbind(1)
         emission = nothing if self.emission is None else self.emission.unbind(1)
         return [
-            Chain(tuple(s[t] for s in selection), tuple(b[t] for b in termination), evidence[t], emission[t], alive)
+            Chain(
+                tuple(s[t] for s in selection),
+                tuple(b[t] for b in termination),
+                evidence[t],
+                emission[t],
+                alive,
+            )
             for t, alive in enumerate(self.alive.unbind(1))
         ]
 
@@ -205,13 +224,18 @@ def complete(tables: Tables, lengths: Tensor) -> Chain:
 
     An inert step keeps every choice and emits nothing, so it changes no probability.
     """
-    tables, steps = tables.normalised(), tables.steps if tables.selection or tables.control else int(lengths.max())
+    tables, steps = (
+        tables.normalised(),
+        tables.steps if tables.selection or tables.control else int(lengths.max()),
+    )
     alive = torch.arange(steps, device=lengths.device) < lengths[:, None]
     selection = tuple(
         _control_selects_control(table.double()) if level < tables.depth else table.double()
         for level, table in enumerate(tables.selection, start=1)
     )
-    termination = tuple(_keep_past_the_end(_control_lasts_one_step(t.double()), alive) for t in tables.termination)
+    termination = tuple(
+        _keep_past_the_end(_control_lasts_one_step(t.double()), alive) for t in tables.termination
+    )
     evidence = _only(alive, tables.joint_evidence())
     emission = _only(alive, tables.power * joint_density(tables.control)) if tables.control else None
     if emission is not None and evidence is not None:

@@ -72,8 +72,12 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
 
 def segments_of(fit: Fit, demos: Demonstrations) -> Segmented:
     """The segments of a fit's demonstrations, in the order and with the numbers of ``demonstrations_by_likelihood``."""
-    labels = {demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos}
-    found = {demo.name: demo for piece in fit.infer(demos) for demo in of_piece(fit, piece, labels, intervals=True)}
+    labels = {
+        demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos
+    }
+    found = {
+        demo.name: demo for piece in fit.infer(demos) for demo in of_piece(fit, piece, labels, intervals=True)
+    }
     rows = fit.metrics.demonstrations_by_likelihood
     held_out = {row.name for row in rows if row.part == "valid"}
     tasks = dict(zip(demos.names, demos.tasks, strict=True))

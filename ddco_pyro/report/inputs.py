@@ -22,10 +22,10 @@ GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS = 8, 1000
 def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, str]]]:
     """For each level, what the policy and the termination of each option depend on, in words, by choice.
 
-    With branches, these are the nats per step lost without the branch. Otherwise they are shares of the gradient's
-    size, Σ_i (∂y/∂x_i · σ_i)², with σ_i the standard deviation of feature i of an observation. Here y are all numbers
-    of the policy, or the termination's logit, at the steps where the option is active. With pictures without branches
-    nothing is said.
+    With branches, these are the nats per step lost without the branch. Otherwise they are shares of the
+    gradient's size, Σ_i (∂y/∂x_i · σ_i)², with σ_i the standard deviation of feature i of an observation.
+    Here y are all numbers of the policy, or the termination's logit, at the steps where the option is active.
+    With pictures without branches nothing is said.
     """
     found: dict[str, dict[str, dict[int, str]]] = {level: {} for level in fit.names}
     levels = list(fit.names)
@@ -81,7 +81,11 @@ def _shares(
 
 def _largest(values: Mapping[str, float | None], words: Callable[[float | None], str]) -> str:
     """The three largest values in words, without those that round to nothing."""
-    first = [key for key in sorted(values, key=lambda key: -(values[key] or 0.0))[:3] if (values[key] or 0.0) >= 0.005]
+    first = [
+        key
+        for key in sorted(values, key=lambda key: -(values[key] or 0.0))[:3]
+        if (values[key] or 0.0) >= 0.005
+    ]
     return ", ".join(f"{key} {words(values[key])}" for key in first)
 
 
@@ -91,7 +95,9 @@ def branches(fit: Fit) -> Section | None:
     for use in fit.metrics.branches:
         for row, losses in enumerate(use.loss):
             inner = use.level < len(levels)
-            name = name_in_level(1 + row, *levels[use.level]) if inner else "meta-policy" if levels else "policy"
+            name = (
+                name_in_level(1 + row, *levels[use.level]) if inner else "meta-policy" if levels else "policy"
+            )
             for branch, activation, loss in zip(use.branches, use.activation[row], losses, strict=True):
                 rows.append([name, branch, number(activation, 3), number(loss, 3)])
     if not rows:

@@ -44,7 +44,10 @@ def section(fit: Fit) -> Section:
             theirs = fit.baselines[name].held_out
             each = [(one.log_likelihood - theirs[one.name]) / one.steps for one in metrics.valid]
             differences.append(Interval.of(other.difference, each))
-        title, axis = f"{method(metrics.model)} minus each baseline", "nats per step above that method, held out"
+        title, axis = (
+            f"{method(metrics.model)} minus each baseline",
+            "nats per step above that method, held out",
+        )
         panels.append(Panel(title, axis, differences, line=0))
         caption = (
             "Left: log-likelihood of each method; filled circle: held out, open circle: training. Right: the model’s "
@@ -147,7 +150,7 @@ def dimensions(fit: Fit) -> Section:
     return Section("dimensions", "Log-likelihood by control dimension", blocks, folded=True)
 
 
-# --- the test against the mixture -------------------------------------------------------------------------------------
+# --- the test against the mixture ---------------------------------------------------------------------------
 
 
 EXPLAINED = (

@@ -35,7 +35,9 @@ def section(fit: Fit, segmented: Segmented, shown: Shown) -> Section:
     blocks: list[Block] = []
     if len(fit.names) > 1:
         named = " Legends give the names of the highest level first." if fit.named else ""
-        blocks.append(Text(f"Each level numbers its own options: equal colours in two levels mean nothing.{named}"))
+        blocks.append(
+            Text(f"Each level numbers its own options: equal colours in two levels mean nothing.{named}")
+        )
     for level in reversed(fit.names) if shown.paths else ():
         options = [demo.levels[level].options for demo in segmented.segments]
         drawing = paths_of_options(shown.paths, options)
@@ -46,7 +48,9 @@ def section(fit: Fit, segmented: Segmented, shown: Shown) -> Section:
         )
         blocks.append(save(drawing, fit.run_folder / "figures" / f"{name}.svg", caption))
     blocks += [Text("Use of the options", "heading"), use_table(fit)]
-    blocks.append(note("On the most likely path of all demonstrations. The same option chosen anew stays one segment."))
+    blocks.append(
+        note("On the most likely path of all demonstrations. The same option chosen anew stays one segment.")
+    )
     for level in reversed(fit.names):
         blocks += use_by_task(segmented, level)
     link = Markup('<a href="#segments">segments of every demonstration</a>')
@@ -69,7 +73,7 @@ def use_table(fit: Fit) -> Table:
     return Table([*head, *(["Label, agreement"] if stands_for else [])], rows, {0, 1, 5})
 
 
-# --- segments ---------------------------------------------------------------------------------------------------------
+# --- segments -----------------------------------------------------------------------------------------------
 
 
 def segments(drawn: Timelines, demonstrations: int) -> Section:
@@ -78,11 +82,13 @@ def segments(drawn: Timelines, demonstrations: int) -> Section:
     blocks: list[Block] = [note(explained), replace(drawn, rows=ROWS)]
     if len(drawn.tracks) < demonstrations:
         command = Markup("<code>ddco-pyro segment RUN FILE --html PAGE</code>")
-        blocks.append(note(Markup("The others would make this page slow; {} makes a page of them.").format(command)))
+        blocks.append(
+            note(Markup("The others would make this page slow; {} makes a page of them.").format(command))
+        )
     return Section("segments", "Segments of every demonstration", blocks)
 
 
-# --- labels -----------------------------------------------------------------------------------------------------------
+# --- labels -------------------------------------------------------------------------------------------------
 
 
 def agreement(fit: Fit, demos: Demonstrations) -> Section | None:
@@ -113,7 +119,10 @@ def agreement(fit: Fit, demos: Demonstrations) -> Section | None:
         blocks.append(Text(f"{capital(told)}."))
     if each := contributions(fit.metrics.training):
         rows = [[name, number(accuracy), number(edit)] for name, (accuracy, edit) in each.items()]
-        blocks += [Text("Left-out labelled demonstrations", "heading"), Table(["", "Accuracy", "Edit score"], rows)]
+        blocks += [
+            Text("Left-out labelled demonstrations", "heading"),
+            Table(["", "Accuracy", "Edit score"], rows),
+        ]
     for level, label, own in zip(names, truth, record.confusion, strict=True):
         names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"

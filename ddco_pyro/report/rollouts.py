@@ -28,7 +28,9 @@ def success(fit: Fit) -> Section | None:
         "Rates: successes of trials (Wilson 95 % interval). Other measures: mean ± standard deviation [95 % interval "
         "of the mean], n episodes in which the measure is known."
     )
-    text = f"{record.episodes} episodes of each method from the same initial states (seeds from {record.seed})."
+    text = (
+        f"{record.episodes} episodes of each method from the same initial states (seeds from {record.seed})."
+    )
     blocks: list[Block] = [Text(text), measures_table(methods), note(explained)]
     if paired := paired_table(methods, fit.metrics.model):
         blocks += [Text("Paired comparison of success", "heading"), paired, note(P_VALUE)]
@@ -38,7 +40,9 @@ def success(fit: Fit) -> Section | None:
 def measures_table(methods: Mapping[str, Method], title: str | None = None) -> Table:
     """Every measure of every method, as in the paper's table."""
     names = list(dict.fromkeys(name for entry in methods.values() for name in entry.measures))
-    rows = [[method(key), *(_cell(entry.measures.get(name)) for name in names)] for key, entry in methods.items()]
+    rows = [
+        [method(key), *(_cell(entry.measures.get(name)) for name in names)] for key, entry in methods.items()
+    ]
     return Table(["Method", *map(measure, names)], rows, title=title)
 
 
@@ -60,14 +64,22 @@ def paired_table(methods: Mapping[str, Method], ours: str) -> Table | None:
         for name, results in methods.items()
         if (pair := results.against)
     ]
-    head = [f"{method(ours)} against", f"Only {method(ours)}: success", "Only the other: success", "Episodes", "p"]
+    head = [
+        f"{method(ours)} against",
+        f"Only {method(ours)}: success",
+        "Only the other: success",
+        "Episodes",
+        "p",
+    ]
     return Table(head, rows) if rows else None
 
 
 def films(fit: Fit) -> Section | None:
     """Filmed rollouts, the model's first; None where nothing was filmed."""
     folder = fit.run_folder
-    paths = sorted((folder / "videos").glob("*.mp4"), key=lambda path: (_named(path)[0] != fit.name, *_named(path)))
+    paths = sorted(
+        (folder / "videos").glob("*.mp4"), key=lambda path: (_named(path)[0] != fit.name, *_named(path))
+    )
     if not paths:
         return None
     explained = "The border has the colour of the lowest level’s option; h1 is its number."
@@ -76,7 +88,9 @@ def films(fit: Fit) -> Section | None:
 
 def films_of(folder: Path, paths: list[Path]) -> list[Drawing]:
     """The films of a run folder with their outcomes, the first ones held in the page."""
-    outcomes = {key: ": success" if value == 1 else ": failure" for key, value in read_successes(folder).items()}
+    outcomes = {
+        key: ": success" if value == 1 else ": failure" for key, value in read_successes(folder).items()
+    }
     left, films = MOST_BYTES, []
     for path in paths:
         name, seed = _named(path)

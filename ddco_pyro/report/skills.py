@@ -79,8 +79,8 @@ def instances(segmented: Segmented, level: str, option: int) -> list[Instance]:
 
     The same option chosen anew stays one segment.
 
-    A segment is the more typical, the larger its mean posterior probability (to two digits), then the nearer its length
-    to the median length.
+    A segment is the more typical, the larger its mean posterior probability (to two digits), then the nearer
+    its length to the median length.
     """
     found = [
         Instance(row, start, end, float(demo.levels[level].probability[start:end].mean()))
@@ -190,7 +190,10 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
     for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
         if len(fit.names) > 1:
             blocks.append(Text(f"Level “{level}”", "heading"))
-        counts, present = transitions(segmented, level), {one.choice: one for one in every if one.level == level}
+        counts, present = (
+            transitions(segmented, level),
+            {one.choice: one for one in every if one.level == level},
+        )
         for choice, one in present.items():
             low, high = np.percentile([len(each) for each in one.found], [25, 75])
             facts = {
@@ -213,7 +216,9 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
                 facts["Most like"] = near
             if finding := whole.get((1 + place, choice)):
                 facts["No skill"] = finding.deed(segmented.frequency)
-            facts |= {what: values[choice] for what, values in reads.get(level, {}).items() if choice in values}
+            facts |= {
+                what: values[choice] for what, values in reads.get(level, {}).items() if choice in values
+            }
             facts = {what: said.replace(" %", "\N{NO-BREAK SPACE}%") for what, said in facts.items()}
             blocks.append(Card(one.name, [Facts(facts), *shown.blocks(one.found, choice)]))
         onset = {
@@ -235,7 +240,11 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
 
 def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
     """The option from which an option's policy differs least, in words; empty for the only one, and for control."""
-    known = [(one.divergence, *one.options) for one in pairs if choice in one.options and one.divergence is not None]
+    known = [
+        (one.divergence, *one.options)
+        for one in pairs
+        if choice in one.options and one.divergence is not None
+    ]
     if not known:
         return ""
     apart, first, second = min(known)
@@ -245,11 +254,14 @@ def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
 def _frequent(counts: np.ndarray, names: Sequence[str]) -> str:
     """The two most frequent ones with their shares."""
     first = np.argsort(-counts, kind="stable")[:2]
-    return ", ".join(f"{names[place]} {percent(counts[place] / counts.sum())}" for place in first if counts[place])
+    return ", ".join(
+        f"{names[place]} {percent(counts[place] / counts.sum())}" for place in first if counts[place]
+    )
 
 
 class Shown:
-    """Pictures and films of segments, from what demonstrations have: pictures, or else paths, or else controls.
+    """Pictures and films of segments, from what demonstrations have: pictures, or else paths, or else
+    controls.
 
     :param demos: in the order of their segments.
     :param pictures: of each demonstration; empty for none.
@@ -257,7 +269,9 @@ class Shown:
     :ivar paths: of each demonstration, turned into the plane of the page, [P, T, 2]; empty without ``drawn``.
     """
 
-    def __init__(self, demos: Demonstrations, pictures: Sequence[Observed], drawn: Sequence[PathSpec]) -> None:
+    def __init__(
+        self, demos: Demonstrations, pictures: Sequence[Observed], drawn: Sequence[PathSpec]
+    ) -> None:
         self.demos, self.pictures, self.drawn = demos, pictures, drawn
         self.films = 0
         self.paths: list[np.ndarray] = []
@@ -312,19 +326,25 @@ class Shown:
         if self.drawn:
             rows = list(dict.fromkeys([*(one.row for one in chosen), *range(len(self.demos))]))[:MOST_PATHS]
             segments = [(rows.index(one.row), one.start, one.end) for one in chosen]
-            return Drawing(typical_paths([self.paths[row] for row in rows], segments, option_colour(choice)), caption)
+            return Drawing(
+                typical_paths([self.paths[row] for row in rows], segments, option_colour(choice)), caption
+            )
         every = [
             self.demos[one.row].actions.reshape(len(self.demos[one.row]), -1)[one.start : one.end, :controls]
             for one in chosen[:INSTANCES]
         ]
-        values = {f"control[{n}]": [array[:, n].astype(float) for array in every] for n in range(every[0].shape[1])}
+        values = {
+            f"control[{n}]": [array[:, n].astype(float) for array in every] for n in range(every[0].shape[1])
+        }
         return Drawing(curves(values, [{"stroke": option_colour(choice)}]), caption)
 
 
 def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Drawing:
     """First, middle and last picture of each instance, a row each."""
     steps = [(one.start, (one.start + one.end - 1) // 2, one.end - 1) for one in chosen]
-    strips = [frames(pictures[one.row], three, SHEET_HEIGHT) for one, three in zip(chosen, steps, strict=True)]
+    strips = [
+        frames(pictures[one.row], three, SHEET_HEIGHT) for one, three in zip(chosen, steps, strict=True)
+    ]
     rows = [np.hstack(list(strip)) for strip in strips]
     return picture(np.vstack(rows), f"First, middle and last pictures of {where}", where)
 

@@ -37,8 +37,15 @@ STAGES = {
 def _stage_name(name: str) -> str:
     """A stage of training in words: ``vq-1`` is ``level 1 from clusters``."""
     kind, _, level = name.partition("-")
-    whole = {"meta-policy": "meta-policy alone", "joint": "all together", "mixture": "all together without memory"}
-    whole |= {"segments": "levels above the lowest from segments", "upper": "levels above the lowest together"}
+    whole = {
+        "meta-policy": "meta-policy alone",
+        "joint": "all together",
+        "mixture": "all together without memory",
+    }
+    whole |= {
+        "segments": "levels above the lowest from segments",
+        "upper": "levels above the lowest together",
+    }
     how = {"vq": "from clusters", "parts": "from equal parts", "level": "alone"}.get(kind)
     return f"level {level} {how}" if how else whole.get(name, name)
 
@@ -82,7 +89,7 @@ def _cut(restarts: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [values for epochs in restarts for values in np.maximum(epochs, least).T]
 
 
-# --- doubts -----------------------------------------------------------------------------------------------------------
+# --- doubts -------------------------------------------------------------------------------------------------
 
 
 def doubts(fit: Fit) -> list[tuple[str, str]]:
@@ -94,7 +101,7 @@ def doubts(fit: Fit) -> list[tuple[str, str]]:
     return [*found, *(degeneracies(metrics, fit.spec, fit.names) if fit.spec.hierarchy else ())]
 
 
-# --- particulars ------------------------------------------------------------------------------------------------------
+# --- particulars --------------------------------------------------------------------------------------------
 
 
 def particulars(fit: Fit) -> Section:

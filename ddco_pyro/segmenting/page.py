@@ -40,7 +40,9 @@ def write_page(path: Path, segmented: Segmented, run: str, file: str, drawn: Tim
     count, held_out = len(segmented), sum(demo.held_out for demo in segmented.segments)
     intro = f"{held_out} of {count} demonstrations were held out when the run was fitted. They are marked “held out”."
     sections = [_level(name, segmented) for name in segmented.counts]
-    how = note(f"{HOW} Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}.")
+    how = note(
+        f"{HOW} Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}."
+    )
     sections.append(Section("segments", "Every demonstration", [how, drawn]))
     page = Page(file, [Text(intro)] if held_out else [], sections, subtitle=f"segmented by {run}")
     write_text(path, page.html())
@@ -79,7 +81,10 @@ def use_by_task(segmented: Segmented, level: str) -> list[Block]:
         if option or any(shares):
             named = Cell(numbered_name(option, names), colour=option_colour(option))
             rows.append([named, *(percent(share) if share else "" for share in shares)])
-    return [Text("Options in tasks", "heading"), Table(["Option", *(task or "no task" for task in tasks)], rows)]
+    return [
+        Text("Options in tasks", "heading"),
+        Table(["Option", *(task or "no task" for task in tasks)], rows),
+    ]
 
 
 def anchor(name: str) -> str:
@@ -102,7 +107,11 @@ def timelines(
     lanes: dict[str, tuple[Any, Any]] = {}  # the names and the colours of values
     for name, count in reversed(segmented.counts.items()):
         names = [option_name(choice, segmented.names.get(name, ())) for choice in range(count + 1)]
-        known = dict(enumerate(names)) | {UNKNOWN: SOURCES[0]} if name + SOURCE in segmented.label_names else names
+        known = (
+            dict(enumerate(names)) | {UNKNOWN: SOURCES[0]}
+            if name + SOURCE in segmented.label_names
+            else names
+        )
         lanes[name] = known, list(map(option_colour, range(count + 1)))
     for name, words in _values(segmented).items():
         matched = segmented.matched.get(name, {}).items()

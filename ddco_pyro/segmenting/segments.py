@@ -31,10 +31,11 @@ from ddco_pyro.metrics import Scores
 class LevelLabels:
     """One level over one demonstration of T steps.
 
-    :param options: choices of the most likely path [T]: 1 to k, or 0 where the caller emits the control; -1 where
-        a person left the step open.
-    :param boundaries: whether the path makes a new choice at this step [T], which may be the same option; true at the
-        first step. Where options end after every step: whether the option differs from the step before.
+    :param options: choices of the most likely path [T]: 1 to k, or 0 where the caller emits the control; -1
+        where a person left the step open.
+    :param boundaries: whether the path makes a new choice at this step [T], which may be the same option;
+        true at the first step. Where options end after every step: whether the option differs from the step
+        before.
     :param probability: posterior probability of the chosen option at each step [T].
     :param intervals: the 90 % interval of each segment's first step [segments, 2], of
         :meth:`~ddco_pyro.evaluation.inferred.Inferred.intervals`; None where unknown.
@@ -87,8 +88,8 @@ class Segmented:
     :param truth: for each level, the name of the labels that the run's spec compares with it.
     :param names: for each level, the name of each choice, control first.
     :param label_names: for labels in the file, the names of labels 0, 1, ...
-    :param matched: for labels that the run's spec compares with a level, the option that each label is matched with
-        in the run's own table: of the lowest level, where labels are compared with several.
+    :param matched: for labels that the run's spec compares with a level, the option that each label is
+        matched with in the run's own table: of the lowest level, where labels are compared with several.
     :param unlike: a line for each reason why demonstrations are unlike those of the fit.
     :param marks: what a person said of demonstrations as a whole: ``exclude``, ``flag``, ``note``.
     """
@@ -110,7 +111,10 @@ class Segmented:
         """The demonstrations that have these labels, by part in words: the held-out ones first, then the others."""
         labelled = [demo for demo in self.segments if truth in demo.labels]
         held_out, others = ([demo for demo in labelled if demo.held_out is held] for held in (True, False))
-        parts = {f"{len(held_out)} held out": held_out, f"{len(others)} {'others' if held_out else 'in all'}": others}
+        parts = {
+            f"{len(held_out)} held out": held_out,
+            f"{len(others)} {'others' if held_out else 'in all'}": others,
+        }
         return {part: group for part, group in parts.items() if group}
 
     @cached_property
@@ -122,7 +126,10 @@ class Segmented:
         agreements: dict[str, dict[str, Scores | None]] = {}
         for level, truth in self.truth.items():
             for part, group in self.labelled(truth).items():
-                options, labels = [demo.levels[level].options for demo in group], [demo.labels[truth] for demo in group]
+                options, labels = (
+                    [demo.levels[level].options for demo in group],
+                    [demo.labels[truth] for demo in group],
+                )
                 scores = agreements.setdefault(level, {})
                 tasks = [demo.task for demo in group]
                 scores[f"options, {part}"] = scores_of(options, labels, tasks)
@@ -146,7 +153,8 @@ def segment(fit: Fit, path: str | Path) -> Segmented:
 
 
 def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bool = False) -> Segmented:
-    """The segments of every demonstration of a source, except those that the run's spec excludes from its file.
+    """The segments of every demonstration of a source, except those that the run's spec excludes from its
+    file.
 
     :param intervals: with the intervals of their boundaries.
     :raises BadInput: the run has no options.
@@ -163,12 +171,16 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
         before = 0  # steps whose labels are in memory
         for name in chosen:
             found = source.read(name)
-            seen = {key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes}
+            seen = {
+                key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes
+            }
             inferred = INFERENCE * len(found) + FOUND * fit.hierarchy.depth * (before + len(found))
             whole = needed([Demonstration.stored(name, seen, found.actions)]) + inferred
             refuse_too_much(whole, f"{name}: segmenting its {len(found)} steps", "divide it, or the file")
             labels[name] = {
-                key: values for key, values in found.labels.items() if values.dtype.kind in "iub" and values.ndim == 1
+                key: values
+                for key, values in found.labels.items()
+                if values.dtype.kind in "iub" and values.ndim == 1
             }
             demo = _demonstration(found, fit)
             compared[name] = traits(demo, demo.observations)
@@ -176,7 +188,9 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
             yield demo
 
     for piece in fit.infer(read()):
-        segmented += (replace(one, task=compared[one.name].task) for one in of_piece(fit, piece, labels, intervals))
+        segmented += (
+            replace(one, task=compared[one.name].task) for one in of_piece(fit, piece, labels, intervals)
+        )
         on_event(Counted("segmenting", len(chosen), done=len(segmented)))
     each, known = of_tasks([demo.task for demo in segmented], [demo.labels for demo in segmented], known)
     segmented = [replace(demo, labels=own) for demo, own in zip(segmented, each, strict=True)]
@@ -240,7 +254,9 @@ def of_piece(
         known = piece.intervals(row) if intervals else [None] * len(fit.names)
         every = zip(fit.spec.levels, piece.segmented(row), piece.posterior.u, known, strict=True)
         each = {  # rounding can exceed 1
-            level.name: LevelLabels(options, starts, np.minimum(u[row].numpy()[steps_of, options], 1.0), within)
+            level.name: LevelLabels(
+                options, starts, np.minimum(u[row].numpy()[steps_of, options], 1.0), within
+            )
             for level, (options, starts), u, within in every
         }
         value = float(piece.log_likelihood[row])

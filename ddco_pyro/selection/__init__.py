@@ -1,7 +1,8 @@
-"""Selection by k-fold cross-validation (paper §4.3) over a grid of spec keys, with the same folds for every candidate.
+"""Selection by k-fold cross-validation (paper §4.3) over a grid of spec keys, with the same folds for every
+candidate.
 
-The folder holds ``selection.json`` (the result), ``folds/`` (the run folder of each candidate's fit without a fold),
-``fit/`` (the final fit) and ``demonstrations.json`` (the digest of the demonstrations).
+The folder holds ``selection.json`` (the result), ``folds/`` (the run folder of each candidate's fit without a
+fold), ``fit/`` (the final fit) and ``demonstrations.json`` (the digest of the demonstrations).
 """
 
 from __future__ import annotations
@@ -31,7 +32,16 @@ from ddco_pyro.training import data
 from ddco_pyro.training.networks import Dimensions, model_name
 from ddco_pyro.training.processes import one_thread
 
-__all__ = ["Choice", "Failed", "Selection", "Workers", "check", "final_spec", "known_demonstrations", "select"]
+__all__ = [
+    "Choice",
+    "Failed",
+    "Selection",
+    "Workers",
+    "check",
+    "final_spec",
+    "known_demonstrations",
+    "select",
+]
 
 ALL_CORES = Workers()
 """One process for each core."""
@@ -39,7 +49,8 @@ ALL_CORES = Workers()
 
 @dataclass(frozen=True)
 class Selection:
-    """A finished cross-validation, its folder, and the demonstrations with the observations of every candidate.
+    """A finished cross-validation, its folder, and the demonstrations with the observations of every
+    candidate.
 
     :param held_out: the names of the demonstrations that each fold holds out.
     """
@@ -81,7 +92,8 @@ def select(
     demos: Demonstrations | None = None,
     resume: bool = True,
 ) -> Selection:
-    """Score every candidate of the spec's grid in every fold, choose one, and write table and figure into the folder.
+    """Score every candidate of the spec's grid in every fold, choose one, and write table and figure into the
+    folder.
 
     Fits that the folder holds are not done again. The result depends on the spec and the demonstrations
     alone, not on workers or interruptions.
@@ -147,7 +159,8 @@ def _fit_all(
 
 
 def _fitted(spec: Spec, demos: Demonstrations, folder: Path) -> Metrics | str:
-    """The metrics of a fit to a fold's demonstrations, on one thread for the same bits anywhere; or why it failed.
+    """The metrics of a fit to a fold's demonstrations, on one thread for the same bits anywhere; or why it
+    failed.
 
     A failure does not stop other folds.
     """
@@ -165,4 +178,6 @@ def final_spec(chosen: Candidate) -> Spec:
     """The spec of the final fit: the chosen candidate on all demonstrations but those that are set apart."""
     if chosen.spec.demonstrations.hold_out_by not in (None, EACH):
         return chosen.spec
-    return with_overrides(chosen.spec, {"demonstrations.hold_out_by": None, "demonstrations.valid_fraction": 0.0})
+    return with_overrides(
+        chosen.spec, {"demonstrations.hold_out_by": None, "demonstrations.valid_fraction": 0.0}
+    )

@@ -1,7 +1,7 @@
 """The choice among candidates by the one-standard-error rule, as data, a table and a figure.
 
-One trained model scores all demonstrations held out in a fold, so their errors are not independent. Every standard
-error here therefore counts a fold, not a demonstration, as one observation.
+One trained model scores all demonstrations held out in a fold, so their errors are not independent. Every
+standard error here therefore counts a fold, not a demonstration, as one observation.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ class Choice:
         return [*self._rising(), *([STD_NOTE] if any(std != stds[0] for std in stds) else [])]
 
     def _rising(self) -> Iterator[str]:
-        """Of each number in the grid whose best value is the largest or the smallest: there may be better ones beyond.
+        """Of each number in the grid whose best value is the largest or the smallest: there may be better
+        ones beyond.
 
         A single option has nothing below.
         """
@@ -119,7 +120,11 @@ class Choice:
             if len(values) < 2 or own not in (min(values), max(values)) or (count and own == 1):
                 continue
             which = "largest" if own == max(values) else "smallest"
-            skills = "; likelihood does not count skills: it also rises where options divide a skill" if count else ""
+            skills = (
+                "; likelihood does not count skills: it also rises where options divide a skill"
+                if count
+                else ""
+            )
             yield (
                 f"{point_name({path: own})} is the best, and the {which} of the grid: the likelihood is still rising "
                 f"there, so extend the grid (selection.grid.{path}){skills}"
@@ -129,7 +134,8 @@ class Choice:
 def choose(candidates: Sequence[Candidate], fits: Mapping[tuple[int, int], Metrics | str]) -> Choice:
     """The best candidate, and the candidate that the one-standard-error rule chooses.
 
-    :param fits: by the number of the candidate and of the fold, which is complete: metrics, or why there are none.
+    :param fits: by the number of the candidate and of the fold, which is complete: metrics, or why there are
+        none.
     """
     rows = []
     for candidate in candidates:
@@ -140,7 +146,9 @@ def choose(candidates: Sequence[Candidate], fits: Mapping[tuple[int, int], Metri
     complete = [row for row in scored if not row.failed]
     reference = max(complete or scored, key=lambda row: row.mean or 0.0, default=None)
     rows = [row.minus(reference) for row in rows]
-    best = next((row for row in rows if complete and reference and row.candidate is reference.candidate), None)
+    best = next(
+        (row for row in rows if complete and reference and row.candidate is reference.candidate), None
+    )
     within = [row for row in rows if within_one_error(row, best)]
     chosen = min(within, key=lambda row: (row.candidate.parameters, -(row.mean or 0.0)), default=None)
     return Choice(rows, best, chosen)
@@ -174,7 +182,9 @@ def as_data(choice: Choice) -> dict[str, Any]:
                 "within_one_standard_error": within_one_error(row, choice.best),
                 "gradient_steps": row.gradient_steps,
                 "not_converged": len(row.unconverged),
-                "folds": [{"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()],
+                "folds": [
+                    {"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()
+                ],
             }
             for row in choice.rows
         ],
@@ -218,7 +228,8 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
 
 
 def write_figure(choice: Choice, path: Path) -> None:
-    """Draw log-likelihoods and paired differences of candidates as SVG; nothing where no candidate was scored.
+    """Draw log-likelihoods and paired differences of candidates as SVG; nothing where no candidate was
+    scored.
 
     A band ends one standard error below the best.
     """
@@ -237,8 +248,18 @@ def write_figure(choice: Choice, path: Path) -> None:
         means.append(None if row.mean is None else Interval.around(row.mean, row.error, points, colour))
         differences.append(None if row.difference is None else Interval.of(row.difference, each, colour))
     panels = [
-        Panel("Each candidate, ± one standard error", "held-out log-likelihood (nats per step)", means, band=band),
-        Panel("Minus the best, ± one standard error", "nats per step above the best, same folds", differences, line=0),
+        Panel(
+            "Each candidate, ± one standard error",
+            "held-out log-likelihood (nats per step)",
+            means,
+            band=band,
+        ),
+        Panel(
+            "Minus the best, ± one standard error",
+            "nats per step above the best, same folds",
+            differences,
+            line=0,
+        ),
     ]
     marks = "orange: chosen, the smallest within one standard error of the best (band); dots: single folds"
     notes = [line for note in choice.notes for line in textwrap.wrap(f"Note: {note}.", 150)]

@@ -80,8 +80,8 @@ def wide(spec: Spec) -> Spec:
 def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
     """The Cartesian product of the grid's values, the last key path changing fastest.
 
-    :raises SpecError: the grid is empty or touches the data, a candidate is not valid, or candidates model a control
-        dimension as different kinds; one line for each problem.
+    :raises SpecError: the grid is empty or touches the data, a candidate is not valid, or candidates model a
+        control dimension as different kinds; one line for each problem.
     """
     grid = spec.selection.grid
     if not grid:
@@ -90,7 +90,10 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
     shared = [path for path in grid if path.partition(".")[0] in DATA]
     if shared:
         raise SpecError(
-            *(f"selection.grid.{path}: candidates are compared on the same data; remove it" for path in shared)
+            *(
+                f"selection.grid.{path}: candidates are compared on the same data; remove it"
+                for path in shared
+            )
         )
     alone: dict[str, Any] = {"selection.grid": {}, "compare_with": []}  # baselines are compared, not selected
     valid, problems = [], []
@@ -115,15 +118,15 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
     return valid
 
 
-# --- folds ------------------------------------------------------------------------------------------------------------
+# --- folds --------------------------------------------------------------------------------------------------
 
 
 def divide(demos: Demonstrations, folds: int, seed: int) -> tuple[Demonstrations, ...]:
     """The demonstrations for each fold, with the masks ``train`` and ``valid``, which is held out.
 
-    Folds are over all demonstrations, or over the training ones where the file has masks for that. Each fold has all
-    demonstrations: their dimensions decide the networks, which are the same in every fold. Of several tasks each is
-    spread over the folds.
+    Folds are over all demonstrations, or over the training ones where the file has masks for that. Each fold
+    has all demonstrations: their dimensions decide the networks, which are the same in every fold. Of several
+    tasks each is spread over the folds.
 
     :raises BadInput: there are fewer demonstrations than folds, or too few to train and tune with.
     """
@@ -136,7 +139,8 @@ def divide(demos: Demonstrations, folds: int, seed: int) -> tuple[Demonstrations
 
 
 def assign(tasks: Sequence[str], folds: int, seed: int) -> list[list[int]]:
-    """The numbers of the demonstrations held out in each fold: a partition, as even as possible, also of each task.
+    """The numbers of the demonstrations held out in each fold: a partition, as even as possible, also of each
+    task.
 
     :param tasks: of each demonstration.
     :raises BadInput: there are fewer demonstrations than folds, or too few to train and tune with.
@@ -147,7 +151,9 @@ def assign(tasks: Sequence[str], folds: int, seed: int) -> list[list[int]]:
     if folds > count:
         raise BadInput(f"selection.folds: {folds} folds of {count} demonstrations; use at most {count}")
     if count - -(-count // folds) < 2:
-        raise BadInput(f"selection.folds: {folds} folds of {count} demonstrations leave less than 2 to train with")
+        raise BadInput(
+            f"selection.folds: {folds} folds of {count} demonstrations leave less than 2 to train with"
+        )
     if are_several(tasks):  # dealt to the folds in turn, task by task
         dealt = sorted(np.random.default_rng(seed).permutation(count).tolist(), key=lambda row: tasks[row])
         return [sorted(dealt[fold::folds]) for fold in range(folds)]

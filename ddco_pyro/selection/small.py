@@ -1,7 +1,8 @@
 """What small fits decide of a spec: heavy tails, and what makes options last as long as is asked for.
 
-The less the control counts, the more a change of option costs beside what it explains. What gates and terminations read
-of the observations costs nothing, so where even a small power leaves segments too short, both become constant.
+The less the control counts, the more a change of option costs beside what it explains. What gates and
+terminations read of the observations costs nothing, so where even a small power leaves segments too short,
+both become constant.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ FIRST, LEAST = 0.5, 0.005
 HALVINGS = 2
 """Powers that are tried between two with gates of one kind."""
 NEAR, FAR = 1.15, 1.5
-"""Factors between the median and what is asked: a search ends within the first, or a step; gates stay as they are
-within the second."""
+"""Factors between the median and what is asked: a search ends within the first, or a step; gates stay as they
+are within the second."""
 LADDER = (0.5, 0.05, 0.02)
 """Powers that are tried in this order where no length is asked for, at last with constant gates."""
 FEW = 3
@@ -105,9 +106,9 @@ def decide(
 def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: OnEvent = ignore) -> Lasting:
     """The power, and gates, with which a fit's median segment has a length that is asked for.
 
-    Fits are of the model alone, to some of the training demonstrations. Where a length is asked for, several windows
-    are tried below :data:`USUAL`, and the one with the best tuning log-likelihood is kept: windows that are longer
-    than skills mix them.
+    Fits are of the model alone, to some of the training demonstrations. Where a length is asked for, several
+    windows are tried below :data:`USUAL`, and the one with the best tuning log-likelihood is kept: windows
+    that are longer than skills mix them.
 
     :param steps: the length, in steps; None for any that is not too short for a skill.
     :raises BadInput: the spec has no options that last.
@@ -128,7 +129,9 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
                 values.append(event.tune)
 
         found = fit(with_overrides(sketch, overrides(spec, power, constant, window)), some, on_event=heard)
-        return Lasting(power, constant, window, segments_of(found.segment(some)[0], demos.frequency), values[-1])
+        return Lasting(
+            power, constant, window, segments_of(found.segment(some)[0], demos.frequency), values[-1]
+        )
 
     def tried(power: float, constant: bool) -> Lasting:
         tries = [begun(power, constant, window) for window in (windows if power < USUAL else [0])]
@@ -163,7 +166,9 @@ def heavy_tails(spec: Spec, demos: Demonstrations) -> tuple[int, ...]:
     some = _some(train_and_valid(spec, demos)["train"])
     if len(some) < FEWEST:
         return ()
-    train, rest = (Demonstrations(tuple(some[place] for place in range(first, len(some), 2))) for first in (0, 1))
+    train, rest = (
+        Demonstrations(tuple(some[place] for place in range(first, len(some), 2))) for first in (0, 1)
+    )
     usual = fit(_sketch(spec), train)
     kinds = usual.hierarchy.scaling.parts
     heavy = tuple(sorted(dim for part in kinds if part.kind == "gaussian" for dim in part.dims))
@@ -175,16 +180,19 @@ def heavy_tails(spec: Spec, demos: Demonstrations) -> tuple[int, ...]:
 
 
 def moved(demos: Demonstrations) -> str:
-    """The vector that controls move most as a position, of three numbers or more, or else of two; empty without one.
+    """The vector that controls move most as a position, of three numbers or more, or else of two; empty
+    without one.
 
-    Its value is the product of three shares: of its changes that controls explain, of its numbers that are drawn (the
-    first three), and of the way of steady steps that the diagonal of the box around it is: 1 along a straight line,
-    near 0 for a velocity. A vector of constant norm, such as a quaternion, is no position.
+    Its value is the product of three shares: of its changes that controls explain, of its numbers that are
+    drawn (the first three), and of the way of steady steps that the diagonal of the box around it is: 1 along
+    a straight line, near 0 for a velocity. A vector of constant norm, such as a quaternion, is no position.
     """
     shapes = demos.observation_shapes
     in_space = [key for key, shape in shapes.items() if len(shape) == 1 and shape[0] >= 3]
     for keys in (in_space, [key for key, shape in shapes.items() if shape == (2,)]):
-        values = {key: _moved([np.asarray(demo.observations[key], float) for demo in demos], demos) for key in keys}
+        values = {
+            key: _moved([np.asarray(demo.observations[key], float) for demo in demos], demos) for key in keys
+        }
         best = max(values, key=values.__getitem__, default="")
         if best and values[best] > 0:
             return best
@@ -197,7 +205,10 @@ def _moved(values: Sequence[np.ndarray], demos: Demonstrations) -> float:
     steps = [np.diff(path, axis=0) for path in points]
     ways = [float(np.sqrt(np.square(each).sum() * len(each))) for each in steps]
     reach = np.mean(
-        [np.linalg.norm(np.ptp(path, axis=0)) / way if way else 0.0 for path, way in zip(points, ways, strict=True)]
+        [
+            np.linalg.norm(np.ptp(path, axis=0)) / way if way else 0.0
+            for path, way in zip(points, ways, strict=True)
+        ]
     )
     if np.ptp(norms) <= 1e-3 * norms.max() or reach == 0:
         return 0.0
@@ -216,7 +227,9 @@ def _moved(values: Sequence[np.ndarray], demos: Demonstrations) -> float:
 
 def with_heavy_tails(spec: Spec, dims: tuple[int, ...]) -> Spec:
     """The spec with one Student t for these control dimensions, if there are any."""
-    return with_overrides(spec, {"control.parts": [{"name": "heavy", "dims": dims, "kind": "student"}]} if dims else {})
+    return with_overrides(
+        spec, {"control.parts": [{"name": "heavy", "dims": dims, "kind": "student"}]} if dims else {}
+    )
 
 
 def in_steps(place: str, length: str, frequency: float | None) -> float:
@@ -233,15 +246,17 @@ def in_steps(place: str, length: str, frequency: float | None) -> float:
     if not 0 < value < math.inf:
         raise BadInput(f"{place} {length}: give seconds, such as 2s, or steps, such as 20")
     if seconds and not frequency:
-        raise BadInput(f"{place} {length}: the demonstrations do not say how many steps a second has; give steps")
+        raise BadInput(
+            f"{place} {length}: the demonstrations do not say how many steps a second has; give steps"
+        )
     return value * frequency if seconds and frequency else value
 
 
 def unasked(tried: Callable[[float, bool], Lasting]) -> Lasting:
     """The first power of :data:`LADDER` whose segments are not :attr:`~ddco_pyro.metrics.Segments.brief`.
 
-    Where that leaves few segments in a demonstration, options are about to become one. Then it is a power between this
-    one and the one before, and where that leaves few segments, too, the one before.
+    Where that leaves few segments in a demonstration, options are about to become one. Then it is a power
+    between this one and the one before, and where that leaves few segments, too, the one before.
     """
     found = before = tried(LADDER[0], False)
     for power in LADDER[1:]:
@@ -259,7 +274,8 @@ def unasked(tried: Callable[[float, bool], Lasting]) -> Lasting:
 
 
 def asked(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
-    """The largest power whose median is about as long as is asked for: down in halves, then between the last two.
+    """The largest power whose median is about as long as is asked for: down in halves, then between the last
+    two.
 
     Too small a power makes segments short again, since options then hardly differ.
     """

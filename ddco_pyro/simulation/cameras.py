@@ -34,8 +34,9 @@ class Camera:
 class Encoded:
     """An observation that is an encoder's features of a camera's picture.
 
-    :param encoder: uint8 [height, width, 3] to float32 [features], such as those of :func:`ddco_pyro.encoding.load`.
-        An optional attribute ``digest`` identifies what the task's sources do not hold, such as weights.
+    :param encoder: uint8 [height, width, 3] to float32 [features], such as those of
+        :func:`ddco_pyro.encoding.load`. An optional attribute ``digest`` identifies what the task's sources
+        do not hold, such as weights.
     """
 
     camera: Camera

@@ -32,12 +32,15 @@ EPISODES_WITH_PICTURES = 8
 def cache_path(task: Task, name: str, spec: DemonstrationsSpec, observed: Collection[str] = ()) -> Path:
     """The cached file of demonstrations of this task, policy, number, seeds and cameras.
 
-    Its name changes with the task's code, encoders and package version, and with the simulators' versions. The folder
-    is ``$DDCO_PYRO_CACHE``, or ``ddco-pyro`` in the user's cache folder.
+    Its name changes with the task's code, encoders and package version, and with the simulators' versions.
+    The folder is ``$DDCO_PYRO_CACHE``, or ``ddco-pyro`` in the user's cache folder.
     """
     cameras = [[camera, task.cameras[camera].digest] for camera in task.seen_by_cameras(observed)]
     package = next((point.dist for point in entry_points(group=TASKS, name=name) if point.dist), None)
-    versions = [*map(importlib.metadata.version, SIMULATORS), package and importlib.metadata.version(package.name)]
+    versions = [
+        *map(importlib.metadata.version, SIMULATORS),
+        package and importlib.metadata.version(package.name),
+    ]
     facts = [name, spec.supervisor, spec.count, spec.seed, cameras, versions]
     digest = hashlib.sha256(json.dumps(facts).encode())
     for source in sorted(task.sources):
@@ -56,8 +59,8 @@ def collect(
 ) -> Path:
     """Record ``spec.count`` demonstrations into a file, unless the file exists; returns its path.
 
-    The root attribute ``supervisor`` holds the supervisor's own success rate, as JSON. Of several processes that want
-    the same file one records it, and the others wait.
+    The root attribute ``supervisor`` holds the supervisor's own success rate, as JSON. Of several processes
+    that want the same file one records it, and the others wait.
 
     :param path: the file; by default one in the cache.
     :param observed: the spec's observations; the task's cameras among them are recorded.
@@ -67,7 +70,9 @@ def collect(
     task = find_task(task_name)
     if spec.supervisor not in task.policies:
         known = ", ".join(sorted(task.policies))
-        raise DemonstrationsError(f"task {task.name!r} has no policy {spec.supervisor!r} to record (it has: {known})")
+        raise DemonstrationsError(
+            f"task {task.name!r} has no policy {spec.supervisor!r} to record (it has: {known})"
+        )
     if path is not None and path.exists():
         _refuse_others(path, task, spec)
     path = path or cache_path(task, task_name, spec, observed)
@@ -83,7 +88,12 @@ def collect(
 
 
 def _record(
-    task: Task, task_name: str, spec: DemonstrationsSpec, path: Path, on_event: OnEvent, observed: Collection[str]
+    task: Task,
+    task_name: str,
+    spec: DemonstrationsSpec,
+    path: Path,
+    on_event: OnEvent,
+    observed: Collection[str],
 ) -> None:
     at_once = EPISODES_WITH_PICTURES if task.seen_by_cameras(observed) else spec.count
     seeds = range(spec.seed, spec.seed + spec.count)
@@ -91,7 +101,9 @@ def _record(
     outcomes = []
     with robomimic_file(path, attributes, {}) as data:
         for first in range(0, len(seeds), at_once):
-            for episode in run_episodes(task_name, spec.supervisor, seeds[first : first + at_once], observed=observed):
+            for episode in run_episodes(
+                task_name, spec.supervisor, seeds[first : first + at_once], observed=observed
+            ):
                 write_demonstration(data, episode.record)
                 outcomes.append(episode.outcome)
                 on_event(Counted("collecting demonstrations", spec.count, done=len(data)))

@@ -23,7 +23,8 @@ class Episode:
 
     :param record: observations, intended controls and labels.
     :param outcome: the task's measures.
-    :param choices: the active option of each level, lowest first, [T, D]; D is 0 for other policies than controllers.
+    :param choices: the active option of each level, lowest first, [T, D]; D is 0 for other policies than
+        controllers.
     :param frames: pictures of the scene, uint8 [H, W, 3]: T + 1 where the episode was filmed, otherwise none.
     """
 
@@ -100,7 +101,9 @@ def run_episodes(
     :param observed: see :func:`run_episode`, also for ``keep``.
     :raises Failed: a process died.
     """
-    calls = {seed: partial(_run_named, task, policy, seed, seed in seeds[:film], observed, keep) for seed in seeds}
+    calls = {
+        seed: partial(_run_named, task, policy, seed, seed in seeds[:film], observed, keep) for seed in seeds
+    }
     with run_all(calls, Workers(jobs), "ran episodes", ordered=True) as episodes:
         yield from (episode for _, episode in episodes)
 
@@ -110,7 +113,8 @@ def _run_named(task: str, *how: Any) -> Episode:
 
 
 def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, Measure]:
-    """Each measure over episodes: a rate with its Wilson 95 % interval, or a mean with Student's 95 % interval.
+    """Each measure over episodes: a rate with its Wilson 95 % interval, or a mean with Student's 95 %
+    interval.
 
     Episodes to which a measure does not apply (NaN) are not among its ``trials``.
     """

@@ -21,7 +21,8 @@ class GymnasiumEnvironment(dm_env.Environment):
 
     ``gymnasium`` is the wrapped environment; ``success`` and ``total`` are the measures of the last episode.
 
-    :raises BadInput: the environment is not registered, its package cannot be imported, or a space has another type.
+    :raises BadInput: the environment is not registered, its package cannot be imported, or a space has
+        another type.
     """
 
     def __init__(self, id: str, seed: int, options: Mapping[str, Any]) -> None:
@@ -34,7 +35,9 @@ class GymnasiumEnvironment(dm_env.Environment):
         space = self.gymnasium.observation_space
         self._named = isinstance(space, spaces.Dict)
         observed = space.spaces if isinstance(space, spaces.Dict) else {"state": space}
-        self._observations = {name: _spec(f"{id}: observation {name!r}", each) for name, each in observed.items()}
+        self._observations = {
+            name: _spec(f"{id}: observation {name!r}", each) for name, each in observed.items()
+        }
         self._control = _spec(f"{id}: the action", self._actions)
 
     def reset(self) -> dm_env.TimeStep:
@@ -58,7 +61,9 @@ class GymnasiumEnvironment(dm_env.Environment):
 
     def _seen(self, observation: Any) -> Observation:
         named = observation if self._named else {"state": observation}
-        return {name: np.asarray(named[name]).reshape(spec.shape) for name, spec in self._observations.items()}
+        return {
+            name: np.asarray(named[name]).reshape(spec.shape) for name, spec in self._observations.items()
+        }
 
     def observation_spec(self) -> dict[str, specs.BoundedArray]:
         return self._observations
@@ -80,7 +85,9 @@ class GymnasiumEnvironment(dm_env.Environment):
         """
         picture = self.gymnasium.render()
         if picture is None:
-            raise BadInput("a film of a Gymnasium task needs Task.from_gymnasium(..., render_mode='rgb_array')")
+            raise BadInput(
+                "a film of a Gymnasium task needs Task.from_gymnasium(..., render_mode='rgb_array')"
+            )
         return np.asarray(picture, np.uint8)
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """Interface of a task: an environment, scripted policies, and measures of success.
 
-The library never imports a task. :func:`find_task` resolves an entry point of the group ``ddco_pyro.tasks`` or
-``module:name`` to a :class:`Task`.
+The library never imports a task. :func:`find_task` resolves an entry point of the group ``ddco_pyro.tasks``
+or ``module:name`` to a :class:`Task`.
 """
 
 from __future__ import annotations
@@ -47,19 +47,20 @@ class Task:
     """A task with a dm_env environment; :meth:`from_gymnasium` makes one from a Gymnasium environment.
 
     :param load: ``load(seed)`` makes a fresh environment; its first ``reset()`` depends on the seed alone.
-    :param policies: ``make(environment)`` of each scripted policy, by name. Demonstrations are collected from the
-        ``"supervisor"``. A policy may look at the environment's true state. Its optional attribute ``annotations``
-        (name to integer, for the step just decided) is stored as ground-truth labels. With an optional attribute
-        ``intended`` [A] that control is recorded, and the disturbed control of ``act`` is executed.
-    :param outcome: measures of the episode that just ended, such as ``{"success": 1.0, "accuracy_mm": 2.1}``; NaN for
-        a measure that does not apply, such as the accuracy of an insertion that never happened.
+    :param policies: ``make(environment)`` of each scripted policy, by name. Demonstrations are collected from
+        the ``"supervisor"``. A policy may look at the environment's true state. Its optional attribute
+        ``annotations`` (name to integer, for the step just decided) is stored as ground-truth labels. With an
+        optional attribute ``intended`` [A] that control is recorded, and the disturbed control of ``act`` is
+        executed.
+    :param outcome: measures of the episode that just ended, such as ``{"success": 1.0, "accuracy_mm": 2.1}``;
+        NaN for a measure that does not apply, such as the accuracy of an insertion that never happened.
     :param frame: a picture of the current scene, uint8 [H, W, 3].
     :param sources: files whose contents determine the demonstrations, for caching.
     :param steps: the largest number of control steps in an episode; 1 where unknown.
-    :param measures: the kind of each measure in ``outcome``: a ``"rate"`` is 0 or 1 in every episode, a ``"mean"`` any
-        number. By default ``success`` is a rate and every other measure a mean.
-    :param cameras: cameras, and encoders of their pictures, by the name of their observation. A camera is drawn only
-        where a spec observes it, because a picture takes longer than a step of simulation.
+    :param measures: the kind of each measure in ``outcome``: a ``"rate"`` is 0 or 1 in every episode, a
+        ``"mean"`` any number. By default ``success`` is a rate and every other measure a mean.
+    :param cameras: cameras, and encoders of their pictures, by the name of their observation. A camera is
+        drawn only where a spec observes it, because a picture takes longer than a step of simulation.
     :raises BadInput: ``measures`` has another kind, or calls ``success`` a mean.
     """
 
@@ -91,14 +92,15 @@ class Task:
     ) -> Task:
         """The task of a registered Gymnasium environment (``pip install 'ddco-pyro[gymnasium]'``).
 
-        Observations: a Box or Discrete space becomes ``state``, a Dict of them keeps its names. Controls: a Box is
-        flattened to [A] and clipped to its bounds; a Discrete action is a control [1], rounded to the nearest action.
-        Measures: ``success`` is ``info["is_success"]`` of the last step, or where there is none whether the episode
-        was terminated rather than truncated; ``return`` is the sum of rewards.
+        Observations: a Box or Discrete space becomes ``state``, a Dict of them keeps its names. Controls: a
+        Box is flattened to [A] and clipped to its bounds; a Discrete action is a control [1], rounded to the
+        nearest action. Measures: ``success`` is ``info["is_success"]`` of the last step, or where there is
+        none whether the episode was terminated rather than truncated; ``return`` is the sum of rewards.
 
         :param id: as in ``gymnasium.make``, such as ``"Pendulum-v1"`` or ``"module:Name-v0"``.
         :param policies: scripted policies; they find the Gymnasium environment as ``environment.gymnasium``.
-        :param options: further arguments of ``gymnasium.make``; ``render_mode="rgb_array"`` is needed for films.
+        :param options: further arguments of ``gymnasium.make``; ``render_mode="rgb_array"`` is needed for
+            films.
         :raises BadInput: gymnasium or the environment's package cannot be imported, the environment is not
             registered, or a space has another type.
         """
@@ -146,7 +148,9 @@ class Task:
         for name, value in outcome.items():
             if self.kind(name) == "rate" and not (value in (0.0, 1.0) or math.isnan(value)):
                 why = "a rate is 0 or 1 in every episode"
-                raise self._wrong(f"{name} is {value:g}, and {why}; make it a mean, which {SUCCESS} cannot be")
+                raise self._wrong(
+                    f"{name} is {value:g}, and {why}; make it a mean, which {SUCCESS} cannot be"
+                )
         return outcome
 
     def _wrong(self, what: str) -> BadInput:
@@ -169,9 +173,13 @@ def find_task(name: str) -> Task:
     except ModuleNotFoundError as error:
         if str(error.name) in name.partition(":")[0]:
             raise BadInput(f"task {name!r} cannot be loaded: {error}") from error
-        raise BadInput(f"task {name!r} needs the package {error.name!r}, which is not installed here") from error
+        raise BadInput(
+            f"task {name!r} needs the package {error.name!r}, which is not installed here"
+        ) from error
     except Exception as error:  # whatever the task's code raises
         raise BadInput(f"task {name!r} cannot be loaded: {' '.join(str(error).split())}") from error
     if not isinstance(task, Task):
-        raise BadInput(f"task {name!r} leads to a {type(task).__name__}, not to a ddco_pyro.simulation.task.Task")
+        raise BadInput(
+            f"task {name!r} leads to a {type(task).__name__}, not to a ddco_pyro.simulation.task.Task"
+        )
     return task

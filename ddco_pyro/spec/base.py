@@ -23,7 +23,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from ddco_pyro.errors import BadInput, nearest
 
-# --- types ------------------------------------------------------------------------------------------------------------
+# --- types --------------------------------------------------------------------------------------------------
 
 T = TypeVar("T")
 Items = Annotated[tuple[T, ...], Field(strict=False)]  # strict would refuse the lists that YAML gives
@@ -70,10 +70,12 @@ def bare(key: str, allowed: Any) -> BeforeValidator:
 def nested(kinds: tuple[type, ...], inner: Any, text: str, names: tuple[str, ...] = ()) -> WrapValidator:
     """A validator for a union of a simple type and ``inner``.
 
-    Values of ``kinds`` are validated as ``inner`` alone, so that an error names the key inside. Of other invalid
-    values the error says that they must be ``text``, and suggests the nearest of ``names``.
+    Values of ``kinds`` are validated as ``inner`` alone, so that an error names the key inside. Of other
+    invalid values the error says that they must be ``text``, and suggests the nearest of ``names``.
     """
-    adapter: TypeAdapter[Any] = TypeAdapter(inner, config=None if isinstance(inner, type) else Model.model_config)
+    adapter: TypeAdapter[Any] = TypeAdapter(
+        inner, config=None if isinstance(inner, type) else Model.model_config
+    )
 
     def choose(value: Any, validate_simple: ValidatorFunctionWrapHandler) -> Any:
         if isinstance(value, kinds):
@@ -86,7 +88,7 @@ def nested(kinds: tuple[type, ...], inner: Any, text: str, names: tuple[str, ...
     return WrapValidator(choose)
 
 
-# --- errors -----------------------------------------------------------------------------------------------------------
+# --- errors -------------------------------------------------------------------------------------------------
 
 
 class SpecError(BadInput):
@@ -164,12 +166,17 @@ def in_words(error: ErrorDetails) -> str:
     """The problem with a value, without its key path."""
     kind = "invalid_key" if "[key]" in error["loc"] else error["type"]
     context = {
-        key: f"{value:.15g}" if isinstance(value, float) else value for key, value in error.get("ctx", {}).items()
+        key: f"{value:.15g}" if isinstance(value, float) else value
+        for key, value in error.get("ctx", {}).items()
     }
     names = re.findall(r"'([^']*)'", context.get("expected", ""))
     context["names"] = " or ".join(names) or "true"
     expected = _MESSAGES.get(kind, error["msg"]).format(**context)
-    return expected if kind == "missing" else f"{expected}, got {show(error['input'])}{nearest(error['input'], names)}"
+    return (
+        expected
+        if kind == "missing"
+        else f"{expected}, got {show(error['input'])}{nearest(error['input'], names)}"
+    )
 
 
 def show(value: Any) -> str:

@@ -32,8 +32,9 @@ class LevelSpec(Model):
     policy: PolicySpec = MlpSpec()
     """The options' policies, π: one network for each option."""
     termination: Termination = LinearSpec(network="linear")
-    """The options' termination conditions, ψ: one network for each option. ``always``: ψ = 1, every option ends after
-    every step; a single such level is a memoryless mixture of experts, with the meta-policy as its gate."""
+    """The options' termination conditions, ψ: one network for each option. ``always``: ψ = 1, every option
+    ends after every step; a single such level is a memoryless mixture of experts, with the meta-policy as its
+    gate."""
 
     @property
     def lasts(self) -> bool:
@@ -51,8 +52,8 @@ class HierarchySpec(Model):
     """Levels of options below a meta-policy."""
 
     trunk: TrunkSpec | None = None
-    """A single network whose last hidden layer replaces the observations for all other networks, which then are
-    ``linear``, ``mlp`` or ``constant``. Null: every network reads the observations."""
+    """A single network whose last hidden layer replaces the observations for all other networks, which then
+    are ``linear``, ``mlp`` or ``constant``. Null: every network reads the observations."""
     levels: Items[LevelSpec] = Field(min_length=1)
     """The levels, lowest first."""
     meta_policy: PolicySpec = MlpSpec(emits=("options",))
@@ -62,7 +63,9 @@ class HierarchySpec(Model):
     def networks(self) -> dict[str, Network]:
         """The networks above the trunk, or the observations, by key path."""
         levels = enumerate(self.levels)
-        of_levels = {f"levels.{n}.{key}": network for n, level in levels for key, network in level.networks.items()}
+        of_levels = {
+            f"levels.{n}.{key}": network for n, level in levels for key, network in level.networks.items()
+        }
         return {"meta_policy": self.meta_policy} | of_levels
 
     def read_by(self, level: int) -> tuple[str, ...]:
@@ -75,7 +78,9 @@ class HierarchySpec(Model):
     @field_validator("levels")
     @classmethod
     def _selecting_below(cls, levels: tuple[LevelSpec, ...]) -> tuple[LevelSpec, ...]:
-        policies = [_emitting(level.policy, "options" if index else "control") for index, level in enumerate(levels)]
+        policies = [
+            _emitting(level.policy, "options" if index else "control") for index, level in enumerate(levels)
+        ]
         pairs = zip(levels, policies, strict=True)
         return tuple(level.model_copy(update={"policy": policy}) for level, policy in pairs)
 
@@ -88,13 +93,18 @@ class HierarchySpec(Model):
         first: dict[str, int] = {}
         for index, level in enumerate(self.levels):
             if first.setdefault(level.name, index) < index:
-                text = f"{level.name!r} is also the name of level {first[level.name]}; give each level its own"
+                text = (
+                    f"{level.name!r} is also the name of level {first[level.name]}; give each level its own"
+                )
                 yield f"levels.{index}.name", text
         if self.levels[0].policy.emits != ("control",):
             yield "levels.0.policy.emits", "the lowest level emits the control and nothing else; leave it out"
         for place, head in self.networks.items() if self.trunk else ():
             if head.network not in HEADS:
-                yield f"{place}.network", f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
+                yield (
+                    f"{place}.network",
+                    f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}",
+                )
             elif head.inputs:
                 yield f"{place}.inputs", "the trunk reads the observations; give inputs there"
 
@@ -110,18 +120,19 @@ class BaselineSpec(Model):
     """A model to compare a hierarchy with: without options, or with options that do not last."""
 
     kind: Kind
-    """``flat``: one policy for all time steps. ``flat_equal``: a flat policy whose hidden layers are scaled by one
-    factor until the policy has as many parameters as the hierarchy. ``per_timestep``: one perceptron for each time
-    step, with the settings in ``policy``. ``mixture``, in ``compare_with``: the hierarchy with all its networks except
-    the terminations, so that every option ends after every step (ψ = 1)."""
+    """``flat``: one policy for all time steps. ``flat_equal``: a flat policy whose hidden layers are scaled
+    by one factor until the policy has as many parameters as the hierarchy. ``per_timestep``: one perceptron
+    for each time step, with the settings in ``policy``. ``mixture``, in ``compare_with``: the hierarchy with
+    all its networks except the terminations, so that every option ends after every step (ψ = 1)."""
     policy: NetworkSpec = MlpSpec()
     """The policy's network, π; a ``mixture`` has those of the hierarchy."""
     optimizer: OptimizerSpec | None = None
     """In ``compare_with``: settings that differ from ``training.optimizer`` for this baseline; null: none."""
     std: LearnedStd | None = None
-    """In ``compare_with``: the σ of this baseline wherever σ is learned in ``control.std`` and ``control.parts``. Null:
-    as in ``control``. The floor stays unless ``floor`` is given. With ``{learn: true, per_state: true}`` the σ of a
-    flat policy depends on the state, as the σ of options differs between options."""
+    """In ``compare_with``: the σ of this baseline wherever σ is learned in ``control.std`` and
+    ``control.parts``. Null: as in ``control``. The floor stays unless ``floor`` is given. With ``{learn:
+    true, per_state: true}`` the σ of a flat policy depends on the state, as the σ of options differs between
+    options."""
 
     def problems(self) -> Problems:
         network = self.policy.network

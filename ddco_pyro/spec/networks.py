@@ -1,7 +1,7 @@
 """Settings of networks: one model for each kind, joined in the tagged union :data:`NetworkSpec`.
 
-The settings are the keyword arguments of the network's class in :mod:`ddco_pyro.model.networks`. Types, defaults and
-bounds are declared here alone, so that a spec and its schema are read without importing torch.
+The settings are the keyword arguments of the network's class in :mod:`ddco_pyro.model.networks`. Types,
+defaults and bounds are declared here alone, so that a spec and its schema are read without importing torch.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Network(Model):
     inputs: Items[Text] = ()
     """Names of the observations that the network reads; empty: all of them."""
     emits: Items[Emission] = Field(default=(), min_length=1)
-    """For policies: what they choose. The lowest level emits ``[control]``. Policies above emit ``options`` (the
-    default), ``control``, or both, which makes a hybrid policy."""
+    """For policies: what they choose. The lowest level emits ``[control]``. Policies above emit ``options``
+    (the default), ``control``, or both, which makes a hybrid policy."""
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -105,8 +105,9 @@ class MlpSpec(LayeredSpec):
     dropout: Share = 0.0
     """Probability with which a hidden unit is dropped in training."""
     activation: Activation = "relu"
-    """Activation after every hidden layer and every convolution. A ``relu`` unit that is 0 for all observations gets no
-    gradient and stays 0; ``leaky_relu`` (slope 0.01 below 0), ``elu`` and ``tanh`` keep a gradient."""
+    """Activation after every hidden layer and every convolution. A ``relu`` unit that is 0 for all
+    observations gets no gradient and stays 0; ``leaky_relu`` (slope 0.01 below 0), ``elu`` and ``tanh`` keep
+    a gradient."""
 
 
 class PerTimestepSpec(MlpSpec):
@@ -137,8 +138,8 @@ class ConvSpec(MlpSpec):
     )
     """The convolutions, first layer first."""
     pool: Pool = "mean"
-    """What is read of each map: the ``mean`` of 8 × 8 fields, all of the map (``flatten``), or the place where the map
-    is active (``spatial_softmax``)."""
+    """What is read of each map: the ``mean`` of 8 × 8 fields, all of the map (``flatten``), or the place
+    where the map is active (``spatial_softmax``)."""
     standardize: bool = False
     """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its pixels and channels."""
 
@@ -164,8 +165,8 @@ class BranchesSpec(MlpSpec):
 
     network: Literal["branches"]  # type: ignore[assignment]
     of: dict[str, TrunkSpec] = Field(min_length=1)
-    """A network for each observation, by the observation's name. A network under another name lists its observations in
-    ``inputs``."""
+    """A network for each observation, by the observation's name. A network under another name lists its
+    observations in ``inputs``."""
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -190,7 +191,9 @@ class UserNetworkSpec(Network):
     def _known(cls, name: str) -> str:
         if name == USER_DEFINED or not re.fullmatch(_USER_DEFINED_PATTERN, name):
             names = [*SETTINGS, USER_DEFINED]
-            raise invalid(("", f"no network is called {name!r}{nearest(name, names)}; use one of {', '.join(names)}"))
+            raise invalid(
+                ("", f"no network is called {name!r}{nearest(name, names)}; use one of {', '.join(names)}")
+            )
         return name
 
 

@@ -9,13 +9,28 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer
 
-from ddco_pyro.spec.base import Count, Items, Model, Positive, Problems, Seed, Share, Text, bare, invalid, nested, show
+from ddco_pyro.spec.base import (
+    Count,
+    Items,
+    Model,
+    Positive,
+    Problems,
+    Seed,
+    Share,
+    Text,
+    bare,
+    invalid,
+    nested,
+    show,
+)
 
 EACH = "demonstration"
 """In place of an attribute in ``demonstrations.hold_out_by``: each demonstration is held out from a further fit."""
 
 LabelNames = Annotated[Items[Text], Field(min_length=1)]
-Labels = Annotated[Text | LabelNames, nested((list, tuple), LabelNames, "a name, or a list with a name for each level")]
+Labels = Annotated[
+    Text | LabelNames, nested((list, tuple), LabelNames, "a name, or a list with a name for each level")
+]
 
 
 class DemonstrationsSpec(Model):
@@ -34,17 +49,18 @@ class DemonstrationsSpec(Model):
     valid_fraction: Share = 0.1
     """Fraction of the demonstrations held out for validation, unless the file has ``mask/valid``; 0 for none."""
     hold_out_by: Text | None = None
-    """An attribute of demonstrations, such as the operator: all demonstrations with some of its values are held out,
-    about ``valid_fraction`` of all, whatever masks the file has. The spec's ``seed`` draws the values.
-    With ``demonstration``, every demonstration trains the model. Held-out results of a demonstration are then of a
-    further fit, which leaves it out. For few demonstrations; ``valid_fraction`` does not apply."""
+    """An attribute of demonstrations, such as the operator: all demonstrations with some of its values are
+    held out, about ``valid_fraction`` of all, whatever masks the file has. The spec's ``seed`` draws the
+    values. With ``demonstration``, every demonstration trains the model. Held-out results of a demonstration
+    are then of a further fit, which leaves it out. For few demonstrations; ``valid_fraction`` does not
+    apply."""
     exclude: Items[Text] = ()
     """Names of demonstrations that are not read."""
     where: dict[str, Annotated[Items[Text], Field(min_length=1)]] = Field(default={})
     """Attributes of demonstrations and their values, such as ``{task: [reach]}``: those with others are not read."""
     labels: Labels | None = None
-    """Ground-truth labels in the file, with which discovered options are compared: one name for all levels, or a list
-    with a name for each level, lowest first. Steps labelled −1 are ignored."""
+    """Ground-truth labels in the file, with which discovered options are compared: one name for all levels,
+    or a list with a name for each level, lowest first. Steps labelled −1 are ignored."""
 
     def problems(self) -> Problems:
         if self.hold_out_by not in (None, EACH) and not self.valid_fraction:
@@ -90,34 +106,35 @@ Part = Annotated[Items[Annotated[int, Field(ge=0)]], Field(min_length=4, max_len
 class ObservationSpec(Model):
     """One observation that the networks read.
 
-    Vectors are shifted and scaled to mean 0 and standard deviation 1 over the training demonstrations. Dimensions that
-    are constant up to rounding are only shifted.
+    Vectors are shifted and scaled to mean 0 and standard deviation 1 over the training demonstrations.
+    Dimensions that are constant up to rounding are only shifted.
     """
 
     key: Text
     """Name of the observation in the demonstrations; ``step`` and ``task`` are built in."""
     minus: Text | None = None
-    """For vectors: an observation of as many numbers that is subtracted, so that a position is relative to another.
-    Networks know the difference as ``KEY-MINUS``."""
+    """For vectors: an observation of as many numbers that is subtracted, so that a position is relative to
+    another. Networks know the difference as ``KEY-MINUS``."""
     differences: bool = False
     """Append x_t − x_{t−1}."""
     angles: Items[Annotated[int, Field(ge=0)]] = ()
-    """For vectors: numbers, counted from 0, that are angles in radians. Each becomes its sine and cosine, behind the
-    other numbers, so that nothing jumps where the angle does by 2π."""
+    """For vectors: numbers, counted from 0, that are angles in radians. Each becomes its sine and cosine,
+    behind the other numbers, so that nothing jumps where the angle does by 2π."""
     quaternions: Items[Annotated[int, Field(ge=0)]] = ()
-    """For vectors: the first of each four numbers that are a unit quaternion, in either order. Each becomes the ten
-    products of two of its numbers, of which a rotation matrix consists, and which are the same for q and −q."""
+    """For vectors: the first of each four numbers that are a unit quaternion, in either order. Each becomes
+    the ten products of two of its numbers, of which a rotation matrix consists, and which are the same for q
+    and −q."""
     bins: Annotated[int, Field(ge=0, le=64)] = 0
-    """For vectors: bins of a piecewise-linear encoding, appended to each number and each difference. A bin holds the
-    number clipped to one part of its range; the parts hold equally many distinct values. Networks can then read small
-    differences within a wide range, such as those of nearly closed jaws."""
+    """For vectors: bins of a piecewise-linear encoding, appended to each number and each difference. A bin
+    holds the number clipped to one part of its range; the parts hold equally many distinct values. Networks
+    can then read small differences within a wide range, such as those of nearly closed jaws."""
     crop: Part | None = None
     """For pictures: top, left, height and width of the crop, in the file's pixels; null: no crop."""
     resize: Size | None = None
     """For pictures: height and width after the crop is scaled by area averaging; null: not scaled."""
     shift: int = Field(default=0, ge=0)
-    """For pictures, in training alone: the largest shift in pixels along either axis. In an epoch all pictures of a
-    trajectory have the same shift; edge pixels are repeated."""
+    """For pictures, in training alone: the largest shift in pixels along either axis. In an epoch all
+    pictures of a trajectory have the same shift; edge pixels are repeated."""
 
     def problems(self) -> Problems:
         if self.crop is not None and 0 in self.crop[2:]:
@@ -161,11 +178,12 @@ class LearnedStd(Model):
     floor: Positive = 0.01
     """Lower bound, in scaled units."""
     per_option: bool = False
-    """Whether each option has its own σ. ``gaussian`` controls that often equal a bound or value let one option collect
-    those steps, independent of the skill; ``clipped``, ``hurdle`` and ``binary`` controls do not."""
+    """Whether each option has its own σ. ``gaussian`` controls that often equal a bound or value let one
+    option collect those steps, independent of the skill; ``clipped``, ``hurdle`` and ``binary`` controls do
+    not."""
     per_state: bool = False
-    """Whether σ depends on the observations: the policy's network outputs σ beside the mean. Each option, and a flat
-    policy, has its own σ."""
+    """Whether σ depends on the observations: the policy's network outputs σ beside the mean. Each option, and
+    a flat policy, has its own σ."""
 
     def problems(self) -> Problems:
         if self.per_option and self.per_state:
@@ -184,10 +202,11 @@ class DistributionSpec(Model):
     """The distribution of all control dimensions, or of some."""
 
     kind: Kind = "auto"
-    """``gaussian``: unbounded; ``student``: heavy tails, those of Student's t with four degrees of freedom, which all
-    dimensions of a step share; ``clipped``: a Gaussian censored at bounds; ``hurdle``: one exact value with some
-    probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete actions, as integers;
-    ``auto``: chosen for each dimension from the demonstrations and shown by ``check``, never ``student``."""
+    """``gaussian``: unbounded; ``student``: heavy tails, those of Student's t with four degrees of freedom,
+    which all dimensions of a step share; ``clipped``: a Gaussian censored at bounds; ``hurdle``: one exact
+    value with some probability, else Gaussian or clipped; ``binary``: two values; ``categorical``: discrete
+    actions, as integers; ``auto``: chosen for each dimension from the demonstrations and shown by ``check``,
+    never ``student``."""
     std: Std | None = None
     """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``; null in a part: as in ``control.std``."""
 
@@ -209,21 +228,25 @@ class ControlSpec(DistributionSpec):
     """The distribution of the control."""
 
     std: Std = 0.1
-    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``. Continuous dimensions are scaled by their
-    mean and spread in the training demonstrations."""
+    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``. Continuous dimensions are
+    scaled by their mean and spread in the training demonstrations."""
     relative_to: Text | None = None
-    """An observation of as many numbers as the control, such as measured joints where the control is their targets.
-    Options are of the control minus this observation. Controllers and exports give the control itself. Null: none."""
+    """An observation of as many numbers as the control, such as measured joints where the control is their
+    targets. Options are of the control minus this observation. Controllers and exports give the control
+    itself. Null: none."""
     power: float = Field(default=1.0, gt=0, le=1)
-    """β: how many times the log-density of the control counts in training and in posteriors of the options (a power, or
-    coarsened, likelihood). The less it counts, the longer segments are. Reported log-likelihoods are of densities."""
+    """β: how many times the log-density of the control counts in training and in posteriors of the options (a
+    power, or coarsened, likelihood). The less it counts, the longer segments are. Reported log-likelihoods
+    are of densities."""
     parts: Items[PartSpec] = ()
     """Groups of dimensions with their own distribution; the settings above hold for all other dimensions."""
 
     @property
     def learned_stds(self) -> dict[str, LearnedStd]:
         """Every learned σ by its key path in the spec."""
-        stds = {"control.std": self.std} | {f"control.parts.{n}.std": part.std for n, part in enumerate(self.parts)}
+        stds = {"control.std": self.std} | {
+            f"control.parts.{n}.std": part.std for n, part in enumerate(self.parts)
+        }
         return {path: std for path, std in stds.items() if isinstance(std, LearnedStd)}
 
     def problems(self) -> Problems:
@@ -258,8 +281,8 @@ class RolloutSpec(Model):
     control: Literal["mean", "sample"] = "mean"
     """Whether the control is the mean of its distribution or a sample."""
     options: OptionExecution = "marginal"
-    """``sample``: sample selections and terminations. ``most_likely``: take the likeliest of each. ``marginal``: act
-    with the options of the largest filtered probability given all observations so far."""
+    """``sample``: sample selections and terminations. ``most_likely``: take the likeliest of each.
+    ``marginal``: act with the options of the largest filtered probability given all observations so far."""
     policies: Items[Text] = ()
     """Scripted policies of the task that are rolled out for comparison, such as ``open_loop``."""
 
@@ -271,7 +294,8 @@ class PathSpec(NamedTuple):
     """Two or three numbers of an observation that are drawn as a path in space.
 
     :param key: name of the observation.
-    :param numbers: which of its numbers, as a Python slice such as ``3:6``; None: the first three, or both of two.
+    :param numbers: which of its numbers, as a Python slice such as ``3:6``; None: the first three, or both of
+        two.
     """
 
     key: str
@@ -287,7 +311,9 @@ class PathSpec(NamedTuple):
 
 
 def _paths(value: Any) -> Any:
-    return tuple(_path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,)))
+    return tuple(
+        _path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,))
+    )
 
 
 def _path(value: Any) -> PathSpec:
@@ -304,7 +330,9 @@ def _written(paths: tuple[PathSpec, ...] | None) -> Any:
 
 def _is_pair(value: Any) -> bool:
     """Whether a value is ``[key, slice]``."""
-    texts = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(part, str) for part in value)
+    texts = (
+        isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(part, str) for part in value)
+    )
     return texts and SLICE.fullmatch(value[1]) is not None
 
 
@@ -319,5 +347,6 @@ class ReportSpec(Model):
     """What the report shows."""
 
     trajectory: Annotated[Trajectory | None, PlainSerializer(_written)] = None
-    """What is drawn as paths in space: an observation (its first three numbers, or both of two), ``[key, slice]``, or a
-    list of these, one for each arm; null: nothing. ``init`` names the observation that controls move."""
+    """What is drawn as paths in space: an observation (its first three numbers, or both of two), ``[key,
+    slice]``, or a list of these, one for each arm; null: nothing. ``init`` names the observation that
+    controls move."""

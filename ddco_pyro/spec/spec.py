@@ -40,9 +40,9 @@ class Spec(Model):
     demonstrations: DemonstrationsSpec = DemonstrationsSpec()
     """Where the demonstrations come from."""
     observations: Items[Observation] = Field(min_length=1)
-    """The observations that the networks read; a bare name stands for ``{key: name}``. ``step`` is built in: the number
-    of the step divided by the steps of the longest training demonstration. So is ``task``: a number for each task of
-    the demonstrations, 1 for the demonstration's own and 0 for the others."""
+    """The observations that the networks read; a bare name stands for ``{key: name}``. ``step`` is built in:
+    the number of the step divided by the steps of the longest training demonstration. So is ``task``: a
+    number for each task of the demonstrations, 1 for the demonstration's own and 0 for the others."""
     control: ControlSpec = ControlSpec()
     """The distribution of the control."""
     hierarchy: HierarchySpec | None = None
@@ -54,8 +54,8 @@ class Spec(Model):
     training: TrainingSpec = TrainingSpec()
     """How the model is trained."""
     inference: Literal["fused", "enumerate"] = "fused"
-    """How latent variables are summed out: ``fused``, one compiled pass, or ``enumerate``, Pyro's enumeration. Both
-    give the same numbers."""
+    """How latent variables are summed out: ``fused``, one compiled pass, or ``enumerate``, Pyro's
+    enumeration. Both give the same numbers."""
     selection: SelectionSpec = SelectionSpec()
     """Cross-validation over a grid."""
     rollout: RolloutSpec = RolloutSpec()
@@ -116,12 +116,21 @@ class Spec(Model):
         if self.hierarchy is None and self.baseline is None:
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
         if self.hierarchy is not None and self.baseline is not None:
-            yield "baseline", "stands beside hierarchy; keep one of the two (compare_with takes baselines to compare)"
+            yield (
+                "baseline",
+                "stands beside hierarchy; keep one of the two (compare_with takes baselines to compare)",
+            )
         baseline = self.baseline
         if baseline and baseline.kind == "mixture":
-            yield "baseline", "mixture takes its experts from a hierarchy; declare one, with termination: always"
+            yield (
+                "baseline",
+                "mixture takes its experts from a hierarchy; declare one, with termination: always",
+            )
         if baseline and baseline.kind == "flat_equal" and "hidden" not in baseline.policy.model_fields_set:
-            yield "baseline", "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat"
+            yield (
+                "baseline",
+                "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat",
+            )
         if baseline and baseline.optimizer:
             yield "baseline.optimizer", "is for baselines in compare_with; give it in training.optimizer"
         if baseline and baseline.std:
@@ -142,7 +151,10 @@ class Spec(Model):
             elif not any(level.lasts for level in self.levels):
                 yield place, "the hierarchy is a mixture already: none of its options lasts; leave it out"
         if self.compare_with and not self.demonstrations.validates:
-            yield "compare_with", "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction"
+            yield (
+                "compare_with",
+                "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction",
+            )
 
     def _observed(self) -> Problems:
         keys = [observation.name for observation in self.observations]
@@ -159,7 +171,10 @@ class Spec(Model):
         for place, key in dict.fromkeys(named):
             if key not in self.observed:
                 there = ", ".join(self.observed)
-                yield place, f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}"
+                yield (
+                    place,
+                    f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}",
+                )
 
     def _labelled(self) -> Problems:
         names, known = self.demonstrations.labels, [level.name for level in self.levels]
@@ -240,7 +255,7 @@ def _given(spec: Spec) -> dict[str, Any]:
     return spec.model_dump(exclude_unset=True)
 
 
-# --- key paths in plain data ------------------------------------------------------------------------------------------
+# --- key paths in plain data --------------------------------------------------------------------------------
 
 _GRID = "selection.grid."
 MODEL = "model"
@@ -255,9 +270,9 @@ _BARE = {"observations": "key", "baseline": "kind", "compare_with": "kind"}
 def edited(data: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """A copy of plain data with other values at some key paths.
 
-    Another ``network`` removes the settings beside it that do not apply to it, unless ``values`` has them too. The key
-    path ``model`` replaces the whole model by a baseline as in ``compare_with``, a list of levels, or a hierarchy;
-    ``options`` keeps the hierarchy.
+    Another ``network`` removes the settings beside it that do not apply to it, unless ``values`` has them
+    too. The key path ``model`` replaces the whole model by a baseline as in ``compare_with``, a list of
+    levels, or a hierarchy; ``options`` keeps the hierarchy.
 
     :raises SpecError: a key path leads nowhere.
     """
@@ -321,7 +336,9 @@ def _find(data: dict[str, Any], path: str) -> tuple[Any, Any]:
             node[key] = {_BARE[parts[0]]: node[key]}
         if not isinstance(node[key], dict | list):
             parent = ".".join(parts[: depth + 1])
-            raise SpecError(f"{path}: cannot be set, because {parent} is {show(node[key])}; set the whole of {parent}")
+            raise SpecError(
+                f"{path}: cannot be set, because {parent} is {show(node[key])}; set the whole of {parent}"
+            )
         node = node[key]
     return node, _key(node, parts[-1], path)
 
@@ -331,4 +348,6 @@ def _key(node: Any, part: str, path: str) -> Any:
         return part
     if part.isdecimal() and int(part) < len(node):
         return int(part)
-    raise SpecError(f"{path}: {part!r} is not the number of one of the {len(node)} items there (the first is 0)")
+    raise SpecError(
+        f"{path}: {part!r} is not the number of one of the {len(node)} items there (the first is 0)"
+    )

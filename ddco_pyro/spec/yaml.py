@@ -23,7 +23,9 @@ class _Loader(yaml.SafeLoader):
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key {key.value!r} is given twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key.value!r} is given twice", key.start_mark
+                )
             seen.add(key.value if isinstance(key, yaml.ScalarNode) else None)
         return super().construct_mapping(node, deep=deep)
 
@@ -59,7 +61,8 @@ _Loader.add_constructor(_INT, _whole)
 
 
 def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
-    """The spec in a YAML file, after ``overrides`` such as ``"hierarchy.levels.0.count=3"`` (the value is YAML).
+    """The spec in a YAML file, after ``overrides`` such as ``"hierarchy.levels.0.count=3"`` (the value is
+    YAML).
 
     Code that the spec names is not imported.
 
@@ -67,9 +70,10 @@ def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool 
     >>> spec.hierarchy.levels[0].count, spec.training.batch_size
     (3, 16)
 
-    :param allow_code: whether the spec may name user code (``module:name``), which later use of the spec imports.
-    :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not allowed; one
-        line for each problem.
+    :param allow_code: whether the spec may name user code (``module:name``), which later use of the spec
+        imports.
+    :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not
+        allowed; one line for each problem.
     """
     data = read_mapping(path_of(path, "spec"), "spec")
     try:
@@ -108,7 +112,9 @@ def dump_spec(spec: Spec) -> str:
 
 def dump_yaml(data: Any) -> str:
     """Plain data as YAML that :func:`read_yaml` reads back."""
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
+    return yaml.dump(
+        data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120
+    )
 
 
 def spec_schema() -> dict[str, Any]:
@@ -130,7 +136,10 @@ def read_yaml(content: bytes | str) -> Any:
         raise SpecError(f"{where}not valid YAML: {error.problem or error.context}") from None
     except RecursionError:
         raise SpecError("not valid YAML: nested too deeply") from None
-    except (yaml.YAMLError, ValueError) as error:  # not text, or a date or number that Python cannot represent
+    except (
+        yaml.YAMLError,
+        ValueError,
+    ) as error:  # not text, or a date or number that Python cannot represent
         raise SpecError(f"not valid YAML: {' '.join(str(error).split())}") from None
 
 
@@ -148,11 +157,12 @@ def _parse_override(text: str) -> tuple[str, Any]:
         raise SpecError(f"override {text!r}: {error}") from None
 
 
-# --- user code --------------------------------------------------------------------------------------------------------
+# --- user code ----------------------------------------------------------------------------------------------
 
 
 def user_code(spec: Spec) -> dict[str, str]:
-    """Key path to ``module:name`` of the code that using the spec imports: its tasks and networks, the grid excluded.
+    """Key path to ``module:name`` of the code that using the spec imports: its tasks and networks, the grid
+    excluded.
 
     Tasks registered by installed packages are not user code.
     """

@@ -26,11 +26,12 @@ State = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What all restarts of a model share: demonstrations to train and to tune on, as they are encoded and scaled.
+    """What all restarts of a model share: demonstrations to train and to tune on, as they are encoded and
+    scaled.
 
     :param names: of the training demonstrations.
-    :param fitted: the state of the fitted encoder and scaling, and of a recogniser that labels train, by the names that
-        they have in a hierarchy (:func:`fitted_of`).
+    :param fitted: the state of the fitted encoder and scaling, and of a recogniser that labels train, by the
+        names that they have in a hierarchy (:func:`fitted_of`).
     :param labels: the labels that say which options are active; None where there are none.
     :param library: the prior that a library is (``training.library``).
     """
@@ -60,9 +61,9 @@ class TrainingData:
     def seed(self, restart: int, *place: int) -> int:
         """The seed of a restart, of one of its stages, of an epoch of a stage, or of a shard of a minibatch.
 
-        The first restarts of two ways to begin have the same seeds, and so have the second ones: the way alone differs.
-        numpy pads with zeros: a stage has the seed of its first epoch, and the first stage that of its restart. They
-        draw different things.
+        The first restarts of two ways to begin have the same seeds, and so have the second ones: the way
+        alone differs. numpy pads with zeros: a stage has the seed of its first epoch, and the first stage
+        that of its restart. They draw different things.
         """
         own, training = self.spec.seed, self.spec.training.seed
         entropy = [own if training is None else training, self.repetition(restart), *place]
@@ -86,9 +87,10 @@ class Progress:
     :param stale: epochs since the best one.
     :param start: tuning log-likelihood per step before the current stage.
     :param best: the best tuning log-likelihood per step of the current stage.
-    :param objective: of the training demonstrations under the model that is kept, with the log-prior of its weights,
-        nats per step.
-    :param sounded: the same at the pause in which restarts are compared; of one that ended before it, at the end.
+    :param objective: of the training demonstrations under the model that is kept, with the log-prior of its
+        weights, nats per step.
+    :param sounded: the same at the pause in which restarts are compared; of one that ended before it, at the
+        end.
     :param ended: a :class:`ddco_pyro.metrics.Stage` for each stage that has ended.
     :param history: a row for each epoch.
     :param device: the kind of device that its networks are trained on.
@@ -128,9 +130,10 @@ class Progress:
 class Restart:
     """A restart in training: its progress and its tensors.
 
-    :param states: tensors of the ``model``, of its ``optimizer`` and of the ``best`` epoch of the current stage; where
-        there are any, of the ``average`` of weights, and the ``known`` choices and the ``constants`` of the objective.
-        A restart that is done has the best alone, one that has diverged nothing.
+    :param states: tensors of the ``model``, of its ``optimizer`` and of the ``best`` epoch of the current
+        stage; where there are any, of the ``average`` of weights, and the ``known`` choices and the
+        ``constants`` of the objective. A restart that is done has the best alone, one that has diverged
+        nothing.
     :param paused: the stage in which it pauses, in memory alone.
     """
 
@@ -141,7 +144,11 @@ class Restart:
     def written(self, path: Path | None) -> Restart:
         """This restart, written as a checkpoint where there is a path: whole or not at all."""
         if path is not None:
-            tensors = {f"{part}/{name}": value for part, state in self.states.items() for name, value in state.items()}
+            tensors = {
+                f"{part}/{name}": value
+                for part, state in self.states.items()
+                for name, value in state.items()
+            }
             write_tensors(path, tensors, {"progress": json.dumps(asdict(self.progress))})
         return self
 
@@ -161,7 +168,9 @@ class Restart:
 
 def fitted_of(model: Hierarchy) -> State:
     """What of a hierarchy is fitted before it is trained: its encoder and its scaling."""
-    return {name: value for name, value in model.state_dict().items() if name.startswith(("encoder.", "scaling."))}
+    return {
+        name: value for name, value in model.state_dict().items() if name.startswith(("encoder.", "scaling."))
+    }
 
 
 def copy_of(model: nn.Module) -> State:

@@ -34,8 +34,9 @@ from ddco_pyro.training.optimizers import optimizer_of
 def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     """The dimensions of the demonstrations that a spec names, without collecting any.
 
-    They are read from the headers of the spec's file, or else from its task. A task whose episodes have no fixed length
-    counts as having one step. The control of a task is described where demonstrations have been collected already.
+    They are read from the headers of the spec's file, or else from its task. A task whose episodes have no
+    fixed length counts as having one step. The control of a task is described where demonstrations have been
+    collected already.
 
     :param demos: the demonstrations, where they have been read.
     """
@@ -73,12 +74,13 @@ def train_and_valid(spec: Spec, demos: Demonstrations) -> dict[str, Demonstratio
     return {"train": train, "valid": valid}
 
 
-def tuning_split(spec: Spec, dimensions: Dimensions, train: Demonstrations) -> tuple[Demonstrations, Demonstrations]:
+def tuning_split(
+    spec: Spec, dimensions: Dimensions, train: Demonstrations
+) -> tuple[Demonstrations, Demonstrations]:
     """The training demonstrations of a model in those that it is fitted to, and those that it is tuned by.
 
-    With ``training.tune_fraction: 0`` both are all of them where EM trains the model or a library is its prior, which
-    needs no early stopping.
-    A mask ``tune`` names those that it is tuned by, in place of a draw.
+    With ``training.tune_fraction: 0`` both are all of them where EM trains the model or a library is its
+    prior, which needs no early stopping. A mask ``tune`` names those that it is tuned by, in place of a draw.
     """
     fraction = spec.training.tune_fraction
     if fraction == 0:
@@ -91,7 +93,8 @@ def tuning_split(spec: Spec, dimensions: Dimensions, train: Demonstrations) -> t
 
 
 def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
-    """Refuse observations that networks cannot read, and a division that leaves too few demonstrations to train with.
+    """Refuse observations that networks cannot read, and a division that leaves too few demonstrations to
+    train with.
 
     :raises DemonstrationsError: one of both is the case.
     """
@@ -100,7 +103,9 @@ def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
         if why := network_input(observed.shape[1:], observed.dtype)[1]:
             raise DemonstrationsError(f"obs/{key} {why}")
     training = spec.training
-    needs_no_tuning = training.library is not None or (training.optimizer.name == "em" and not spec.compare_with)
+    needs_no_tuning = training.library is not None or (
+        training.optimizer.name == "em" and not spec.compare_with
+    )
     if training.tune_fraction > 0 or not needs_no_tuning:  # or one is enough
         check_trained(train_and_valid(spec, demos)["train"].names)
 
@@ -119,8 +124,8 @@ def known_demonstrations(spec: Spec) -> Demonstrations | None:
 def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
     """The spec's demonstrations, read from its file or collected from its task's supervisor.
 
-    :raises DemonstrationsError: the file is missing or damaged, lacks an observation or label that the spec names, or
-        a fit to it takes more memory than is allowed.
+    :raises DemonstrationsError: the file is missing or damaged, lacks an observation or label that the spec
+        names, or a fit to it takes more memory than is allowed.
     """
     sought = spec.demonstrations
     path = sought.file
@@ -130,7 +135,8 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
 
 
 def outline(spec: Spec) -> Demonstrations:
-    """The demonstrations in the spec's file, with zeros in place of observations, of which the headers alone are read.
+    """The demonstrations in the spec's file, with zeros in place of observations, of which the headers alone
+    are read.
 
     The one that controls are relative to is read.
 
@@ -147,7 +153,11 @@ def _read(spec: Spec, path: Path, ready: Callable[[Demonstration], Demonstration
     :raises DemonstrationsError: the file is missing or damaged, or a fit to it does not fit into memory.
     """
     if not path.exists():
-        read = ["actions", *(f"obs/{key}" for key in spec.observed), *(f"labels/{name}" for name in _labels(spec))]
+        read = [
+            "actions",
+            *(f"obs/{key}" for key in spec.observed),
+            *(f"labels/{name}" for name in _labels(spec)),
+        ]
         raise DemonstrationsError(
             f"demonstrations.path: {path}: there is no such file; put it there, or fit to another with --set "
             f"demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with {', '.join(read)} in each "
@@ -178,7 +188,8 @@ def _measured(spec: Spec) -> tuple[str, ...]:
 
 
 def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
-    """Demonstrations in memory, reduced to the observations and labels that a spec names, without the excluded ones.
+    """Demonstrations in memory, reduced to the observations and labels that a spec names, without the
+    excluded ones.
 
     :raises DemonstrationsError: an observation, a label or an excluded demonstration is missing.
     """
@@ -193,7 +204,9 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
         for name in names:
             if name not in there:
                 known = ", ".join(there) or "nothing"
-                raise DemonstrationsError(f"there is no {kind}/{name}{nearest(name, there)}; there is: {known}")
+                raise DemonstrationsError(
+                    f"there is no {kind}/{name}{nearest(name, there)}; there is: {known}"
+                )
     if exclude:
         demos.select(exclude)  # or one of them is not there
     kept = tuple(
@@ -205,12 +218,15 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
         for demo in demos
         if demo.name not in exclude
     )
-    masks = {mask: tuple(name for name in names if name not in exclude) for mask, names in demos.masks.items()}
+    masks = {
+        mask: tuple(name for name in names if name not in exclude) for mask, names in demos.masks.items()
+    }
     return _set_apart(spec, replace(demos, demonstrations=kept, masks=masks))
 
 
 def _set_apart(spec: Spec, demos: Demonstrations) -> Demonstrations:
-    """The demonstrations with the mask ``valid`` that ``hold_out_by`` asks for, in place of masks of the file.
+    """The demonstrations with the mask ``valid`` that ``hold_out_by`` asks for, in place of masks of the
+    file.
 
     They have the observation ``task`` where the spec names it, and labels of two tasks differ.
 

@@ -1,18 +1,20 @@
-"""Expectation-maximisation (§4.1) for hierarchies whose networks are linear: exact E-steps, closed or Newton M-steps.
+"""Expectation-maximisation (§4.1) for hierarchies whose networks are linear: exact E-steps, closed or Newton
+M-steps.
 
-Every output of a network is z = W^T x, where x has a 1 at its end. One backward pass of the exact log-likelihood gives
-its gradient g in every output, and the posterior in every table (the E-step). The M-step then solves, for each network,
+Every output of a network is z = W^T x, where x has a 1 at its end. One backward pass of the exact
+log-likelihood gives its gradient g in every output, and the posterior in every table (the E-step). The M-step
+then solves, for each network,
 
     (Σ_t h_t x_t x_t^T + R) (W' - W) = Σ_t x_t g_t^T - R W
 
-where h is the information that the posterior expects of an output and R a ridge. With a library W - W0 stands for W on
-the right (:class:`~ddco_pyro.training.prior.Prior`). For the mean of a Gaussian, clipped or
-not, this is the weighted least squares of the M-step (for a clipped one: of the censored moments, by Fisher's
-identity). For switches and terminations it is one Fisher scoring step. For categories and gates h is at least Fisher's
-information, one matrix for each output in place of one for each pair. σ follows in closed form.
+where h is the information that the posterior expects of an output and R a ridge. With a library W - W0 stands
+for W on the right (:class:`~ddco_pyro.training.prior.Prior`). For the mean of a Gaussian, clipped or not,
+this is the weighted least squares of the M-step (for a clipped one: of the censored moments, by Fisher's
+identity). For switches and terminations it is one Fisher scoring step. For categories and gates h is at least
+Fisher's information, one matrix for each output in place of one for each pair. σ follows in closed form.
 
-Steps are overrelaxed (Salakhutdinov and Roweis 2003): as long as each raises the penalised log-likelihood, the next is
-longer. A step that lowers it is halved, and the next one is EM's own.
+Steps are overrelaxed (Salakhutdinov and Roweis 2003): as long as each raises the penalised log-likelihood,
+the next is longer. A step that lowers it is halved, and the next one is EM's own.
 """
 
 from __future__ import annotations
@@ -65,8 +67,8 @@ Score = Callable[[Tables, Batch, Tensor], Tensor]
 
 
 class Features:
-    """The features of a piece of the demonstrations. What networks say of a step is float32, as they compute it, and so
-    are gradients of a piece. Sums over pieces, and the matrices that are solved, are float64.
+    """The features of a piece of the demonstrations. What networks say of a step is float32, as they compute
+    it, and so are gradients of a piece. Sums over pieces, and the matrices that are solved, are float64.
 
     :param reads: the vectors that networks read; none for constants.
     :ivar x: the vectors with a 1 at the end, [N, T, F].
@@ -77,7 +79,9 @@ class Features:
 
     def outputs(self, weights: Sequence[Tensor]) -> list[Tensor]:
         """W^T x of networks with weights [K, F, n] each: [N, T, K, n] each."""
-        said = self.x.flatten(0, 1) @ torch.cat([own.transpose(0, 1).flatten(1) for own in weights], 1).to(self.x)
+        said = self.x.flatten(0, 1) @ torch.cat([own.transpose(0, 1).flatten(1) for own in weights], 1).to(
+            self.x
+        )
         parts = said.split([own.shape[0] * own.shape[2] for own in weights], 1)
         shapes = ((*self.x.shape[:2], own.shape[0], own.shape[2]) for own in weights)
         return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
@@ -111,8 +115,8 @@ class Sums:
 
     :ivar gradient: in W, [K, F, n].
     :ivar std: the gradient in σ, [K, C].
-    :ivar groups: of outputs, by the first: the group, of the last piece, its matrix of information, and how many
-        controls it stands for, [K].
+    :ivar groups: of outputs, by the first: the group, of the last piece, its matrix of information, and how
+        many controls it stands for, [K].
     """
 
     gradient: Tensor | float = 0.0
@@ -134,7 +138,9 @@ class Linear:
     :param library: the same network of a library, at whose weights the prior is centred; None for 0.
     """
 
-    def __init__(self, network: nn.Module, ridge: float, trained: bool, library: nn.Module | None = None) -> None:
+    def __init__(
+        self, network: nn.Module, ridge: float, trained: bool, library: nn.Module | None = None
+    ) -> None:
         self.ridge, self.trained, self.reads = ridge, trained, tuple(cast(Mlp, network).reads)
         self.layer = _layer(network)
         self.weight = _weight(self.layer)
@@ -168,7 +174,9 @@ class Std:
     :param library: the same caller of a library, whose σ these controls have; None where ``count`` is 0.
     """
 
-    def __init__(self, caller: Caller, trained: bool, count: float = 0.0, library: Caller | None = None) -> None:
+    def __init__(
+        self, caller: Caller, trained: bool, count: float = 0.0, library: Caller | None = None
+    ) -> None:
         assert caller.std is not None
         self.module, self.trained, self.count = caller.std, trained, count
         self.learned = [*caller.std.own, *caller.std.shared]
@@ -221,12 +229,13 @@ class Expectation:
     :param trained: prefixes of the names of the parameters that change.
     :param score: what is maximised of a piece of the demonstrations.
     :param discovering: d has levels 1 to d alone under a uniform meta-policy.
-    :param roughly: whether the end is a start alone, for which :data:`MOST` steps and :data:`ROUGHLY` are enough.
+    :param roughly: whether the end is a start alone, for which :data:`MOST` steps and :data:`ROUGHLY` are
+        enough.
     :param prior: that of a library, in place of the ridges; None without one.
     :ivar steps: steps of the demonstrations that are learned from, once the first step has begun.
     :ivar value: the penalised log-likelihood of the weights that the last step began at.
-    :ivar gain: the larger gain of the last two steps, nats per step; a stretched one that gains nothing may have gone
-        too far.
+    :ivar gain: the larger gain of the last two steps, nats per step; a stretched one that gains nothing may
+        have gone too far.
     :ivar stretch: of the last step, 1 for EM's own.
     """
 
@@ -284,7 +293,9 @@ class Expectation:
         value, penalised, sums = self._expect(batch)
         stretch = min(GROWTH * self.stretch, FARTHEST)
         for halvings in range(1 + HALVINGS):
-            if self._before is None or (halvings < HALVINGS and penalised >= self.value - 1e-9 * abs(self.value)):
+            if self._before is None or (
+                halvings < HALVINGS and penalised >= self.value - 1e-9 * abs(self.value)
+            ):
                 break
             now, stretch = self._state(), 1.0
             half = {name: 0.5 * (old + now[name]) for name, old in self._before.items()}
@@ -318,7 +329,9 @@ class Expectation:
             network.weight = before[name] + self.stretch * (network.weight - before[name])
         for name, std in self._stds.items():
             old = before[f"{name}.std"]
-            longer = (old * (std.value / old) ** self.stretch).maximum(std.module.floor.double() + ABOVE_FLOOR)
+            longer = (old * (std.value / old) ** self.stretch).maximum(
+                std.module.floor.double() + ABOVE_FLOOR
+            )
             std.value = torch.where(std.value == old, old, longer)
 
     def _penalty(self, sums: Mapping[str, Sums]) -> float:
@@ -361,7 +374,9 @@ class Expectation:
         if not self._pieces:
             order = batch.by_length[:: math.ceil(batch.steps / MOST) if self._roughly else 1]
             chosen = batch.select(order)
-            self._pieces = [(order[rows], piece, {}) for rows, piece in chosen.pieces(self.model.steps_at_once)]
+            self._pieces = [
+                (order[rows], piece, {}) for rows, piece in chosen.pieces(self.model.steps_at_once)
+            ]
             self.steps = chosen.steps
         for piece in self._pieces:
             total += self._expect_piece(*piece, sums)
@@ -370,24 +385,30 @@ class Expectation:
     def _expect_piece(
         self, rows: Tensor, piece: Batch, xs: dict[tuple[str, ...], Features], sums: dict[str, Sums]
     ) -> float:
-        """The score of a piece. Its gradient in the log-tables is the posterior, from which gradients in logits follow.
-        torch differentiates the densities alone.
+        """The score of a piece. Its gradient in the log-tables is the posterior, from which gradients in
+        logits follow. torch differentiates the densities alone.
         """
         levels, power = self.model.option_levels()[: self._discovering], float(self.model.power)
         said: dict[str, Tensor] = {}
         for reads in dict.fromkeys(network.reads for network in self._networks.values()):
             if reads not in xs:
                 xs[reads] = Features(piece.inputs, reads)
-            weights = {name: network.weight for name, network in self._networks.items() if network.reads == reads}
+            weights = {
+                name: network.weight for name, network in self._networks.items() if network.reads == reads
+            }
             said |= zip(weights, xs[reads].outputs([*weights.values()]), strict=True)
         stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
         for name in stds:
             said[name].requires_grad_()
         callers = {
-            name: caller(said[name], self.model.scaling, stds.get(name)) for name, caller in self._callers.items()
+            name: caller(said[name], self.model.scaling, stds.get(name))
+            for name, caller in self._callers.items()
         }
         named = [f"levels.{number}" for number in range(len(levels))]
-        logits = [said[f"{name}.termination"].squeeze(-1) if f"{name}.termination" in said else None for name in named]
+        logits = [
+            said[f"{name}.termination"].squeeze(-1) if f"{name}.termination" in said else None
+            for name in named
+        ]
         top = callers["meta_policy"]
         if self._discovering:
             uniform = torch.zeros(*piece.inputs.batch, 1, levels[-1].count)
@@ -398,14 +419,24 @@ class Expectation:
         leaves = [None if leaf is None else leaf.detach().requires_grad_() for leaf in tables.leaves()]
         value = self._score(Tables.of(tables.depth, leaves, power), piece, rows)
         found = torch.autograd.grad(value, [leaf for leaf in leaves if leaf is not None], allow_unused=True)
-        chosen, ended, acted = found[: len(levels)], found[len(levels) : 2 * len(levels)], found[2 * len(levels) :]
+        chosen, ended, acted = (
+            found[: len(levels)],
+            found[len(levels) : 2 * len(levels)],
+            found[2 * len(levels) :],
+        )
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
-        acting = {name: own for name, own in zip(every, acted, strict=False) if name in stds and own is not None}
+        acting = {
+            name: own for name, own in zip(every, acted, strict=False) if name in stds and own is not None
+        }
         densities = [table for name, table in zip(every, tables.control, strict=False) if name in acting]
         wanted = [leaf[name] for leaf in (said, stds) for name in acting]
         weighed = [(own * table).sum() for own, table in zip(acting.values(), densities, strict=True)]
-        slopes = torch.autograd.grad(weighed, wanted, allow_unused=True) if acting else ()  # weights would import sympy
-        of, of_std = (dict(zip(acting, part, strict=True)) for part in (slopes[: len(acting)], slopes[len(acting) :]))
+        slopes = (
+            torch.autograd.grad(weighed, wanted, allow_unused=True) if acting else ()
+        )  # weights would import sympy
+        of, of_std = (
+            dict(zip(acting, part, strict=True)) for part in (slopes[: len(acting)], slopes[len(acting) :])
+        )
         learned: dict[str, list[Information]] = {}
         with torch.no_grad():
             selecting = (name for name in every if callers[name].options)
@@ -418,7 +449,9 @@ class Expectation:
                     learned[name] = [Information.of_logits(columns, asked, p[..., -columns.stop :])]
             for name, own in acting.items():
                 if name in sums:
-                    of[name][..., self._callers[name].sizes[0] :] /= power  # M-steps of policies know no power
+                    of[name][..., self._callers[name].sizes[0] :] /= (
+                        power  # M-steps of policies know no power
+                    )
                     emission = callers[name].emission
                     assert emission is not None  # it has parameters
                     caller, emission = self._callers[name], emission.map(Tensor.detach)
@@ -427,7 +460,10 @@ class Expectation:
             for prefix, end, logit in zip(named, ended, before.termination, strict=True):
                 name = f"{prefix}.termination"
                 if name in sums and end is not None:
-                    slope, ending = 1 - (logit[..., 1:] / TERMINATION_BOUND).square(), logit[..., 1:].sigmoid()
+                    slope, ending = (
+                        1 - (logit[..., 1:] / TERMINATION_BOUND).square(),
+                        logit[..., 1:].sigmoid(),
+                    )
                     asked = end[..., :1] + end[..., 1:]
                     of[name] = (end[..., 1:] - asked * ending) * slope
                     learned[name] = [Information(slice(0, 1), asked * ending * (1 - ending) * slope.square())]
@@ -469,14 +505,21 @@ class Expectation:
                     solved = torch.linalg.solve(information + ridge.diag(), right)
                     # Σ w E[(a - W^T x)²] from the gradient in σ (Fisher's identity), then that of W'
                     square = variance * (count.unsqueeze(1) + sigma * own.std[:, list(group.std)])
-                    moved = (solved * (information @ solved)).sum(1) - 2 * variance * (solved * gradient).sum(1)
+                    moved = (solved * (information @ solved)).sum(1) - 2 * variance * (solved * gradient).sum(
+                        1
+                    )
                     square = square + moved + self._penalties(away + solved, self._ridge.policy)
-                    square, count = square + std.squares(group.std), count + self._prior_count(away) + std.count
+                    square, count = (
+                        square + std.squares(group.std),
+                        count + self._prior_count(away) + std.count,
+                    )
                     value = std.updated(value, square, count, group.std)
                 else:
                     emitted = name in self._callers and columns.start >= self._callers[name].sizes[0]
                     strength = self._ridge.policy if emitted else network.ridge
-                    solved = _damped(information, gradient, away, _ridges(away.shape[1], strength, self._bias))
+                    solved = _damped(
+                        information, gradient, away, _ridges(away.shape[1], strength, self._bias)
+                    )
                 change[..., columns] = solved
             network.weight = network.weight + change
             if std is not None and std.trained and value is not None:

@@ -2,14 +2,15 @@
 
 Segments are clusters of observations (vector quantisation, SM 2.2), also with controls, or equal parts.
 
-The paper clones one policy from each cluster. Here the whole model is trained with the choices of a level clamped to
-these segments. This clones the policies and starts the terminations from the clusters' boundaries, at any level.
+The paper clones one policy from each cluster. Here the whole model is trained with the choices of a level
+clamped to these segments. This clones the policies and starts the terminations from the clusters' boundaries,
+at any level.
 
 In these clusters demonstrations that are left out choose the ridge of policies.
 
-Labels name clusters. Where every option has labelled steps, multinomial logistic regression assigns the other steps.
-Where some options have labelled steps, their clusters start from the means of these steps (seeded k-means, Basu et al.
-2002).
+Labels name clusters. Where every option has labelled steps, multinomial logistic regression assigns the other
+steps. Where some options have labelled steps, their clusters start from the means of these steps (seeded
+k-means, Basu et al. 2002).
 """
 
 from __future__ import annotations
@@ -43,15 +44,15 @@ ITERATIONS = 300
 class Clusters:
     """k-means clusters of the observations of every step of a batch, named as the options 1 to k.
 
-    Fewer than ``options`` clusters are found where there are fewer distinct observations. The clusters are fitted to at
-    most :data:`ENOUGH` steps, with labels to :func:`most_rows`, drawn at random.
+    Fewer than ``options`` clusters are found where there are fewer distinct observations. The clusters are
+    fitted to at most :data:`ENOUGH` steps, with labels to :func:`most_rows`, drawn at random.
 
-    :param controls: cluster observations and controls together, with equal weight on either. Steps with similar
-        observations and different controls are then in different clusters.
+    :param controls: cluster observations and controls together, with equal weight on either. Steps with
+        similar observations and different controls are then in different clusters.
     :param labels: the options of labelled steps, 1 to m, and -1 for the others, [N, T].
     :param read: names of the observations that are clustered; all where it is empty.
-    :param best: the best of ten runs of k-means, nearly the same ones whatever the seed; otherwise a single run from
-        steps drawn at random.
+    :param best: the best of ten runs of k-means, nearly the same ones whatever the seed; otherwise a single
+        run from steps drawn at random.
     :param window: steps before and after a step over which what is clustered is averaged.
     """
 
@@ -121,7 +122,8 @@ def joined(seen: Tensor, actions: Tensor) -> Tensor:
 
 
 def equal_parts(batch: Batch, options: int) -> Tensor:
-    """The part of each step in trajectories cut into ``options`` equal parts, [N, T], 1 to k; 0 where there is padding.
+    """The part of each step in trajectories cut into ``options`` equal parts, [N, T], 1 to k; 0 where there
+    is padding.
 
     Training of left-to-right hidden Markov models starts from this uniform segmentation.
     """
@@ -129,7 +131,7 @@ def equal_parts(batch: Batch, options: int) -> Tensor:
     return torch.where(batch.alive, part, 0)
 
 
-# --- ways to begin ----------------------------------------------------------------------------------------------------
+# --- ways to begin ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ WAYS: Mapping[Start | Literal["library"], Way] = {
 """Every way to begin, by its name in a spec, and that of a model with a library (``training.library``)."""
 
 
-# --- labels and clusters ----------------------------------------------------------------------------------------------
+# --- labels and clusters ------------------------------------------------------------------------------------
 
 
 class _Start:
@@ -197,7 +199,7 @@ def distinct(rows: np.ndarray, most: int) -> int:
     return len(seen)
 
 
-# --- the ridge with which EM begins -----------------------------------------------------------------------------------
+# --- the ridge with which EM begins -------------------------------------------------------------------------
 
 RAISED = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """The ridges that are tried, in units of the spec's own."""
@@ -212,14 +214,16 @@ LEAST = 0.01
 def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> float:
     """The smallest of the ridges :data:`RAISED` that is large enough for the policies of a linear hierarchy.
 
-    For each cluster of observations and controls, as many as the lowest level has options, ridge regression predicts
-    the continuous controls of demonstrations that are left out. EM begins from such regressions.
+    For each cluster of observations and controls, as many as the lowest level has options, ridge regression
+    predicts the continuous controls of demonstrations that are left out. EM begins from such regressions.
 
     :param batch: the training demonstrations; one alone leaves nothing to predict.
     :param ridge: the spec's own.
     """
     scaling = model.scaling
-    dims = [dim for own, part in zip(scaling.groups, scaling.parts, strict=True) if part.continuous for dim in own]
+    dims = [
+        dim for own, part in zip(scaling.groups, scaling.parts, strict=True) if part.continuous for dim in own
+    ]
     (policy, *_), count = model.networks().values(), model.option_levels()[0].count if model.depth else 1
     assert isinstance(policy, Mlp)  # EM trains no other
     if len(batch) < 2 or not dims or not ridge or not policy.reads:
@@ -227,7 +231,9 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
     given = batch.inputs.select(policy.reads).vector.double()
     x = torch.cat([given, given.new_ones(*given.shape[:-1], 1)], dim=-1)
     alive = batch.alive
-    clusters = Clusters(batch, count, seed, controls=True, read=policy.reads).choices(batch) if count > 1 else alive
+    clusters = (
+        Clusters(batch, count, seed, controls=True, read=policy.reads).choices(batch) if count > 1 else alive
+    )
     fold = (torch.arange(len(batch)) % min(FOLDS, len(batch))).unsqueeze(1)
     ridges = ridge * torch.tensor(RAISED, dtype=torch.float64)
     total = torch.zeros_like(ridges)

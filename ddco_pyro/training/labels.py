@@ -41,12 +41,15 @@ class Labels:
     def of(cls, spec: Spec, train: Demonstrations, tune: Demonstrations) -> Labels | None:
         """The labels that training uses; None where the spec names none.
 
-        :raises SpecError: the demonstrations to train with have no labels, or there are more labels than options.
+        :raises SpecError: the demonstrations to train with have no labels, or there are more labels than
+            options.
         """
         labels = spec.training.labels
         if labels is None or spec.hierarchy is None:
             return None
-        number, level = next(item for item in enumerate(spec.hierarchy.levels, 1) if item[1].name == labels.level)
+        number, level = next(
+            item for item in enumerate(spec.hierarchy.levels, 1) if item[1].name == labels.level
+        )
         each = (*train, *(() if tune is train else tune))
         used = [demo for demo in each if (demo.labels[labels.source] >= 0).any()]
         values = _distinct(demo.labels[labels.source] for demo in used)
@@ -74,7 +77,10 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     if spec.training.labels is None:
         return None
     return Labels.of(
-        spec, *tuning_split(spec, Dimensions.of(demos, spec.control.relative_to), train_and_valid(spec, demos)["train"])
+        spec,
+        *tuning_split(
+            spec, Dimensions.of(demos, spec.control.relative_to), train_and_valid(spec, demos)["train"]
+        ),
     )
 
 

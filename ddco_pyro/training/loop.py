@@ -1,12 +1,13 @@
-"""The training loop of one restart (paper §4.1, SM 2.2, SM 2.3): stages, epochs, gradient steps, early stopping.
+"""The training loop of one restart (paper §4.1, SM 2.2, SM 2.3): stages, epochs, gradient steps, early
+stopping.
 
-The gradient of the marginal log-likelihood *is* the expectation-gradient step: the posteriors of the E-step weight the
-gradients of the networks. A gradient step sees a minibatch of whole trajectories.
+The gradient of the marginal log-likelihood *is* the expectation-gradient step: the posteriors of the E-step
+weight the gradients of the networks. A gradient step sees a minibatch of whole trajectories.
 
-The random numbers of an epoch are seeded by (seed, restart, stage, epoch). Gradient steps that are continued from the
-end of any epoch, in this process or another, therefore have the same bits as without an interruption. The gradients of
-a minibatch's shards (``training.shards``) are added in the order of the shards, so that the number of processes that
-compute them changes no bit either.
+The random numbers of an epoch are seeded by (seed, restart, stage, epoch). Gradient steps that are continued
+from the end of any epoch, in this process or another, therefore have the same bits as without an
+interruption. The gradients of a minibatch's shards (``training.shards``) are added in the order of the
+shards, so that the number of processes that compute them changes no bit either.
 """
 
 from __future__ import annotations
@@ -56,12 +57,14 @@ def train(
     checkpoint: Path | None = None,
     on_event: OnEvent = ignore,
 ) -> Restart:
-    """Train a restart further, on one thread, together with the processes of ``torchrun`` (:meth:`Ranks.here`).
+    """Train a restart further, on one thread, together with the processes of ``torchrun``
+    (:meth:`Ranks.here`).
 
-    :param until: epochs of the last stage after which training pauses; None to train until patience or budget end it.
-        A restart whose steps are over all demonstrations goes on from there in this process alone.
-    :param checkpoint: the file that the restart is written to, at the end of epochs of gradient steps and of the
-        training. Steps over all demonstrations take seconds: those of a stage are made again after an interruption.
+    :param until: epochs of the last stage after which training pauses; None to train until patience or budget
+        end it. A restart whose steps are over all demonstrations goes on from there in this process alone.
+    :param checkpoint: the file that the restart is written to, at the end of epochs of gradient steps and of
+        the training. Steps over all demonstrations take seconds: those of a stage are made again after an
+        interruption.
     """
     now, states, spec = restart.progress, restart.states, data.spec.training
     saved = -math.inf
@@ -92,7 +95,9 @@ def train(
                     now.objective = stage.reached()
                     if until is not None:
                         now.sounded = now.objective
-                now.stage, now.epoch, now.done = (now.stage, now.epoch, True) if last else (now.stage + 1, 0, False)
+                now.stage, now.epoch, now.done = (
+                    (now.stage, now.epoch, True) if last else (now.stage + 1, 0, False)
+                )
             restart.states = {"best": states["best"]}
         except Diverged as error:
             now.done, now.diverged, restart.states = True, str(error), {}
@@ -101,19 +106,30 @@ def train(
 
 
 class StageTraining:
-    """A stage of a restart in training: the model, the objective, the optimiser, and the running mean of the weights.
+    """A stage of a restart in training: the model, the objective, the optimiser, and the running mean of the
+    weights.
 
-    The stage begins, or goes on from the restart's checkpoint. Tuning demonstrations end it and choose its epoch; EM
-    before the last stage goes on until it converges instead, since a stage is a start for the next one.
+    The stage begins, or goes on from the restart's checkpoint. Tuning demonstrations end it and choose its
+    epoch; EM before the last stage goes on until it converges instead, since a stage is a start for the next
+    one.
 
     :param last: whether it is the last stage of the restart.
     :ivar whole: steps over all demonstrations at once; None for gradient steps on minibatches.
-    :ivar kept: the model that is evaluated and kept: the exponential running mean of the weights over gradient steps
-        (Polyak and Juditsky 1992) where ``training.average`` asks for it, the trained model otherwise.
+    :ivar kept: the model that is evaluated and kept: the exponential running mean of the weights over
+        gradient steps (Polyak and Juditsky 1992) where ``training.average`` asks for it, the trained model
+        otherwise.
     """
 
-    def __init__(self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, last: bool) -> None:
-        self.data, self.model, self.stage, self.restart, self.ranks = data, model, stage, restart, Ranks.here()
+    def __init__(
+        self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, last: bool
+    ) -> None:
+        self.data, self.model, self.stage, self.restart, self.ranks = (
+            data,
+            model,
+            stage,
+            restart,
+            Ranks.here(),
+        )
         self.spec, self.last, now = data.spec.training, last, restart.progress
         if stage.memoryless:
             model.begin_terminations()
@@ -123,7 +139,9 @@ class StageTraining:
         optimizer = optimizer_of(self.spec.optimizer, model)
         if optimizer == "em":
             ridge, discovering = self.spec.optimizer.ridge, stage.discovering
-            self.whole = Expectation(model, stage.trained, self._score, ridge, discovering, not last, data.library)
+            self.whole = Expectation(
+                model, stage.trained, self._score, ridge, discovering, not last, data.library
+            )
         elif optimizer == "lbfgs":
             gradient = partial(backward, self.objective)
             self.whole = QuasiNewton(model, gradient, self.spec.optimizer.weight_decay)
@@ -228,12 +246,20 @@ class StageTraining:
         """:func:`backward`, shard after shard; the processes take turns in computing them."""
         steps, at, total = int(batch.lengths[rows].sum()), self.restart.progress, 0.0
         sums: Gradients = [None] * len(self.parameters)
-        seeds = (self.data.seed(at.restart, at.stage, at.epoch, number, shard) for shard in range(self.spec.shards))
-        shards = zip(rows.tensor_split(min(self.spec.shards, len(rows))), seeds, strict=False)  # none is empty
-        for value, gradients in self.ranks.each(partial(self._shard, batch, *shard, steps) for shard in shards):
+        seeds = (
+            self.data.seed(at.restart, at.stage, at.epoch, number, shard) for shard in range(self.spec.shards)
+        )
+        shards = zip(
+            rows.tensor_split(min(self.spec.shards, len(rows))), seeds, strict=False
+        )  # none is empty
+        for value, gradients in self.ranks.each(
+            partial(self._shard, batch, *shard, steps) for shard in shards
+        ):
             total += value
             pairs = zip(sums, gradients, strict=True)
-            sums = [before if now is None else now if before is None else before + now for before, now in pairs]
+            sums = [
+                before if now is None else now if before is None else before + now for before, now in pairs
+            ]
         for parameter, gradient in zip(self.parameters, sums, strict=True):
             parameter.grad = None if gradient is None else torch.from_numpy(gradient).to(parameter.device)
         return total
@@ -254,17 +280,22 @@ class StageTraining:
         return {"model": copy_of(self.model), "optimizer": optimizer_state(self.optimizer), **average}
 
     def reached(self) -> float:
-        """The objective of the training demonstrations under the best epoch's model, with the log-prior of the ridges
-        where EM trains it, nats per step.
+        """The objective of the training demonstrations under the best epoch's model, with the log-prior of
+        the ridges where EM trains it, nats per step.
         """
-        train, model = self.data.train, self.data.hierarchy(self.restart.progress.restart, self.restart.states["best"])
+        train, model = (
+            self.data.train,
+            self.data.hierarchy(self.restart.progress.restart, self.restart.states["best"]),
+        )
         if isinstance(self.whole, Expectation):
             ridge, library = self.spec.optimizer.ridge, self.data.library
             score = Expectation(model, EVERYTHING, self._score, ridge, prior=library).objective(train)
         else:
             with torch.no_grad():
                 pieces = train.pieces(model.steps_at_once)
-                tables = ((self.objective.tables(model, piece, rows), piece.lengths) for rows, piece in pieces)
+                tables = (
+                    (self.objective.tables(model, piece, rows), piece.lengths) for rows, piece in pieces
+                )
                 score = sum(float(self.objective.values(*pair).sum()) for pair in tables)
                 score += 0.0 if self.data.library is None else float(self.data.library.log_density(model))
         return score / train.steps
@@ -276,7 +307,9 @@ class StageTraining:
         now.ended.append(stage_end(self.stage.name, cap, now.tune, self.spec.patience, self._at_optimum))
 
 
-def backward(objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor, steps: int | None = None) -> float:
+def backward(
+    objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor, steps: int | None = None
+) -> float:
     """Add the gradient of the loss of some demonstrations to the parameters' gradients.
 
     The loss is minus the objective per step, and minus the log-prior of a library per step of all training

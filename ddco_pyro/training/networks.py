@@ -70,8 +70,8 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
 
     A typing error in a size is refused before it fills the memory.
 
-    :raises SpecError: something in the spec does not fit the observations, the control or this machine, or the model is
-        larger than any that can be trained.
+    :raises SpecError: something in the spec does not fit the observations, the control or this machine, or
+        the model is larger than any that can be trained.
     """
     choices = math.prod(1 + level.count for level in spec.levels)
     if choices > MOST_CHOICES:
@@ -91,7 +91,9 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         if parameters(hierarchy) <= MOST_PARAMETERS:
             return hierarchy
         size = f"{parameters(hierarchy)} parameters, more than {MOST_PARAMETERS}"
-    raise SpecError(f"the networks have {size}; lower count, hidden, filters or kernel, or scale the images down")
+    raise SpecError(
+        f"the networks have {size}; lower count, hidden, filters or kernel, or scale the images down"
+    )
 
 
 def parameters(network: nn.Module) -> int:
@@ -111,7 +113,8 @@ def model_name(spec: Spec) -> str:
 
 
 def check_models(spec: Spec, dimensions: Dimensions) -> dict[str, tuple[Spec, Hierarchy]]:
-    """The specs and networks (:func:`check_networks`) of a spec's model and its baselines, by name, the model first.
+    """The specs and networks (:func:`check_networks`) of a spec's model and its baselines, by name, the model
+    first.
 
     :raises SpecError: as :func:`check_networks`.
     """
@@ -167,7 +170,9 @@ def baseline_spec(spec: Spec, baseline: BaselineSpec, dimensions: Dimensions) ->
     return resized(nearest_widths(baseline.policy.hidden_sizes, target, count))
 
 
-def nearest_widths(hidden: Sequence[int], target: int, parameters: Callable[[tuple[int, ...]], int]) -> tuple[int, ...]:
+def nearest_widths(
+    hidden: Sequence[int], target: int, parameters: Callable[[tuple[int, ...]], int]
+) -> tuple[int, ...]:
     """Sizes of hidden layers, scaled by one factor, whose number of ``parameters`` is nearest to ``target``.
 
     Of two equally near ones the narrower is taken.

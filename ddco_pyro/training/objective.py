@@ -38,9 +38,9 @@ Known = dict[int, Tensor]
 class Objective:
     """The objective of a stage: the log-likelihood given the known choices.
 
-    In a stage with ``from_constants`` the expected log-probability of selections and terminations (an M-step) takes the
-    place of the log-likelihood. In a stage with ``selecting`` the levels and the meta-policy are trained apart: the
-    objective is the sum of two log-likelihoods, and their mean is what is reported.
+    In a stage with ``from_constants`` the expected log-probability of selections and terminations (an M-step)
+    takes the place of the log-likelihood. In a stage with ``selecting`` the levels and the meta-policy are
+    trained apart: the objective is the sum of two log-likelihoods, and their mean is what is reported.
 
     :param states: the checkpoint from which the stage goes on; None at the beginning of the stage.
     :ivar known: the known choices of the training and of the tuning demonstrations.
@@ -148,12 +148,16 @@ class Objective:
         """
         tune, training, prior = self.data.tune, self.data.spec.training, 0.0
         with torch.no_grad():
-            each = self.ranks.each(partial(self._tuned, model, *piece) for piece in tune.pieces(model.steps_at_once))
+            each = self.ranks.each(
+                partial(self._tuned, model, *piece) for piece in tune.pieces(model.steps_at_once)
+            )
             values = list(chain.from_iterable(each))
             if self.data.library is not None and training.tune_fraction == 0:
                 prior = float(self.data.library.log_density(model)) / tune.steps
         if training.tune_by == "median":
-            return prior + median(value / steps for value, steps in zip(values, tune.lengths.tolist(), strict=True))
+            return prior + median(
+                value / steps for value, steps in zip(values, tune.lengths.tolist(), strict=True)
+            )
         return prior + sum(values) / tune.steps
 
     def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> list[float]:
@@ -164,7 +168,9 @@ class Objective:
         """The error that names the training demonstrations whose log-likelihood is not finite."""
         with torch.no_grad():
             values = log_likelihood(tables, lengths)
-        bad = [self.data.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok]
+        bad = [
+            self.data.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok
+        ]
         where = ", ".join(bad) or "this minibatch (no trajectory alone)"
         return Diverged(
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "

@@ -19,8 +19,8 @@ from ddco_pyro.training.em import TOLERANCE
 def optimizer_of(spec: OptimizerSpec, model: Hierarchy) -> str:
     """The optimiser that trains a model: the spec's own, except for ``em`` and networks that are not linear.
 
-    Without options the log-likelihood is a sum over steps: ``lbfgs`` maximises it for perceptrons that draw nothing at
-    random. ``adam`` trains all others.
+    Without options the log-likelihood is a sum over steps: ``lbfgs`` maximises it for perceptrons that draw
+    nothing at random. ``adam`` trains all others.
     """
     if spec.name != "em":
         return spec.name
@@ -39,12 +39,14 @@ def is_linear(model: Hierarchy) -> bool:
     )
 
 
-# --- gradient steps on minibatches ------------------------------------------------------------------------------------
+# --- gradient steps on minibatches --------------------------------------------------------------------------
 
 MOMENTUM = 0.9
 
 
-def gradient_optimizer(name: str, spec: OptimizerSpec, parameters: list[nn.Parameter]) -> torch.optim.Optimizer:
+def gradient_optimizer(
+    name: str, spec: OptimizerSpec, parameters: list[nn.Parameter]
+) -> torch.optim.Optimizer:
     """``adam``, ``adamw`` or ``momentum``."""
     common = {"params": parameters, "lr": spec.lr, "weight_decay": spec.weight_decay}
     if name == "momentum":
@@ -90,7 +92,7 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Tens
     optimizer.load_state_dict({**optimizer.state_dict(), "state": nested})
 
 
-# --- steps over all demonstrations ------------------------------------------------------------------------------------
+# --- steps over all demonstrations --------------------------------------------------------------------------
 
 HISTORY = 20
 """Pairs of steps and changes of the gradient that L-BFGS keeps."""
@@ -99,14 +101,17 @@ EVALUATIONS = 25
 
 
 class QuasiNewton:
-    """L-BFGS (Liu and Nocedal 1989) with a line search for the strong Wolfe conditions, over all demonstrations.
+    """L-BFGS (Liu and Nocedal 1989) with a line search for the strong Wolfe conditions, over all
+    demonstrations.
 
     :param backward: adds the gradient of minus the log-likelihood per step; the log-likelihood, nats.
     :param decay: L2 penalty.
     :ivar steps: steps of the demonstrations, once the first step has begun.
     """
 
-    def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Batch, Tensor], float], decay: float) -> None:
+    def __init__(
+        self, model: Hierarchy, backward: Callable[[Hierarchy, Batch, Tensor], float], decay: float
+    ) -> None:
         self.model, self._backward, self._decay, self.steps = model, backward, decay, 0
         self._gains = [math.inf]
         self._parameters = list(model.parameters())

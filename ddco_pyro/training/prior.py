@@ -1,13 +1,13 @@
 """The prior that a library of options is for a new task: a Gaussian centred at its weights, and one of σ.
 
-The library is a fitted model of the same networks, with weights W0 and standard deviations s. A ridge of ρ stands for
-as many steps that say W0, and a spread of c for as many controls that have the σ of the library:
+The library is a fitted model of the same networks, with weights W0 and standard deviations s. A ridge of ρ
+stands for as many steps that say W0, and a spread of c for as many controls that have the σ of the library:
 
     W ~ N(W0, 1/ρ),    W ~ N(W0, σ²/ρ) for means of continuous controls,    1/σ² ~ Gamma(c/2, c s²/2).
 
-Biases have it, too. Without the prior of σ a ridge that is centred elsewhere than 0 counts residuals of 0, and σ
-collapses. The density of σ is that of log σ. What is of policies' controls counts β times (``control.power``), as the
-density of their controls does.
+Biases have it, too. Without the prior of σ a ridge that is centred elsewhere than 0 counts residuals of 0,
+and σ collapses. The density of σ is that of log σ. What is of policies' controls counts β times
+(``control.power``), as the density of their controls does.
 """
 
 from __future__ import annotations
@@ -101,7 +101,9 @@ class Prior:
             squares = known.table().detach().double().expand(caller.copies, -1)[copies, places].square()
             half = 0.5 * self.spread * (caller.copies if key == "raw" else 1)
             precision = Gamma(torch.full_like(squares, half), half * squares)
-            of_log = TransformedDistribution(precision, [ExpTransform().inv, AffineTransform(0.0, -0.5)]).to_event()
+            of_log = TransformedDistribution(
+                precision, [ExpTransform().inv, AffineTransform(0.0, -0.5)]
+            ).to_event()
             drawn = site(f"{place}.log_{key}".replace(".", "_"), of_log, value.log(), power).exp()
             for column, own in zip(places, drawn.unbind(-1), strict=True):
                 columns[column] = own.expand(caller.copies)
@@ -109,12 +111,16 @@ class Prior:
             found[f"{place}.std.{key}"] = raw[0] if key == "raw" else raw
         return torch.stack(columns, -1)
 
-    def _weights(self, place: str, model: Hierarchy, std: Tensor | None, site: Site, found: dict[str, Tensor]) -> None:
+    def _weights(
+        self, place: str, model: Hierarchy, std: Tensor | None, site: Site, found: dict[str, Tensor]
+    ) -> None:
         """The weights of a network: those of choices and those of a control are sites of their own."""
         network, center = model.networks()[place], self.model.networks()[place]
         caller = model.named_callers().get(place)
         last = f"layers.{len(network.layers) - 1}."
-        for (name, value), (_, known) in zip(network.named_parameters(), center.named_parameters(), strict=True):
+        for (name, value), (_, known) in zip(
+            network.named_parameters(), center.named_parameters(), strict=True
+        ):
             is_last = name.startswith(last)
             choices = value.shape[-1]
             if caller is not None and std is not None:

@@ -1,7 +1,8 @@
 """Processes and devices: ranks that train one restart together, and what makes work on a device repeatable.
 
-Ranks are started by ``torchrun`` and connected by ``torch.distributed``. All ranks come to the same exchanges in the
-same order. Results are passed on in the order of the calls that gave them, whichever rank computed them.
+Ranks are started by ``torchrun`` and connected by ``torch.distributed``. All ranks come to the same exchanges
+in the same order. Results are passed on in the order of the calls that gave them, whichever rank computed
+them.
 """
 
 from __future__ import annotations
@@ -44,7 +45,11 @@ class Ranks:
     @classmethod
     def here(cls) -> Ranks:
         """This process among those that :func:`together` has connected; elsewhere a single process."""
-        return cls(distributed.get_rank(), distributed.get_world_size()) if distributed.is_initialized() else cls()
+        return (
+            cls(distributed.get_rank(), distributed.get_world_size())
+            if distributed.is_initialized()
+            else cls()
+        )
 
     def share(self, value: Any = None) -> Any:
         """The value that the first process gives, in each process.
@@ -92,8 +97,8 @@ LAUNCHED = {"RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"}
 """The environment variables of processes that ``torchrun`` starts."""
 
 PATIENCE = timedelta(days=1)
-"""How long a process waits for the others between exchanges. A process that ends is noticed at once, since its
-connections close."""
+"""How long a process waits for the others between exchanges. A process that ends is noticed at once, since
+its connections close."""
 
 
 @contextmanager
@@ -134,7 +139,7 @@ def connected() -> Iterator[None]:
         raise Failed(LOST) from error
 
 
-# --- devices ----------------------------------------------------------------------------------------------------------
+# --- devices ------------------------------------------------------------------------------------------------
 
 WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
 """The environment variable that makes the order of sums in cuBLAS fixed; CUDA reads it at its first use."""

@@ -56,8 +56,8 @@ def recognise(model: Hierarchy, data: TrainingData, demos: Demonstrations) -> tu
 
     :param model: the hierarchy, with fitted encoder and scaling.
     :param demos: those to train and to tune with.
-    :returns: the data with the power β of the control, and with starts and evidence of steps without labels; and how
-        much the recogniser counts.
+    :returns: the data with the power β of the control, and with starts and evidence of steps without labels;
+        and how much the recogniser counts.
     """
     labels, own, recogniser = data.labels, data.spec.training.labels, model.recogniser
     assert labels and own and own.recogniser and recogniser  # noqa: PT018
@@ -146,12 +146,18 @@ def half_widths(typical: float) -> Tensor:
 
 
 def _tried(
-    data: TrainingData, windows: Windows, features: Tensor, batch: Batch, options: Tensor, names: tuple[str, ...]
+    data: TrainingData,
+    windows: Windows,
+    features: Tensor,
+    batch: Batch,
+    options: Tensor,
+    names: tuple[str, ...],
 ) -> list[Candidate]:
     """The candidates, each with its scores of the labelled steps that are left out.
 
-    A model of the other labels decodes the left-out steps with each candidate. EM trains it on all demonstrations, the
-    left-out ones without their labels; a model that takes gradient steps is trained on labelled ones alone.
+    A model of the other labels decodes the left-out steps with each candidate. EM trains it on all
+    demonstrations, the left-out ones without their labels; a model that takes gradient steps is trained on
+    labelled ones alone.
     """
     assert data.labels is not None
     level, scores = data.labels.level, dict[tuple[float, float, float], list[tuple[float, float]]]()
@@ -162,7 +168,11 @@ def _tried(
             learn(windows, features[known > 0], known[known > 0], ridge)
             ratios[ridge] = windows.log_ratio(features)
         begun = _begun(
-            data, batch, torch.where(known < 0, ratios[RIDGES[1]][..., 1:].argmax(-1) + 1, known), known, names
+            data,
+            batch,
+            torch.where(known < 0, ratios[RIDGES[1]][..., 1:].argmax(-1) + 1, known),
+            known,
+            names,
         )
         (rows,) = torch.where((hidden & (options > 0)).any(1))
         part, truth = batch.select(rows), torch.where(hidden, options, -1)[rows]
@@ -198,7 +208,9 @@ def _left_out(options: Tensor, lengths: Tensor) -> Iterator[Tensor]:
             yield hidden
 
 
-def _begun(data: TrainingData, batch: Batch, starts: Tensor, known: Tensor, names: tuple[str, ...]) -> Hierarchy:
+def _begun(
+    data: TrainingData, batch: Batch, starts: Tensor, known: Tensor, names: tuple[str, ...]
+) -> Hierarchy:
     """A model whose options begin as the labels say, and as the recogniser says of other steps."""
     assert data.labels is not None
     model = data.hierarchy(0)

@@ -1,10 +1,11 @@
 """Restarts: a model is trained from several starts, and the likeliest in training is kept.
 
-EM and gradient ascent end near where they began. ``training.starts`` lists ways to begin; each is a restart. All
-restarts train for :data:`SOUNDING` epochs of their last stage. Those that are far behind by then are stopped, and the
-others train until patience or budget end them. The objective that decides is of the training demonstrations: the
-log-likelihood (``control.power``) with the log-prior of the ridges. A restart whose log-likelihood becomes NaN or
-infinite ends there and ranks last. Neither the number of processes nor an interruption changes the result.
+EM and gradient ascent end near where they began. ``training.starts`` lists ways to begin; each is a restart.
+All restarts train for :data:`SOUNDING` epochs of their last stage. Those that are far behind by then are
+stopped, and the others train until patience or budget end them. The objective that decides is of the training
+demonstrations: the log-likelihood (``control.power``) with the log-prior of the ridges. A restart whose
+log-likelihood becomes NaN or infinite ends there and ranks last. Neither the number of processes nor an
+interruption changes the result.
 
 A hierarchy contains its memoryless mixture (ψ = 1), and EM ends with one that is no less likely in training
 (:meth:`Trainer.contain`).
@@ -116,15 +117,17 @@ class Trainer:
     :ivar hierarchy: the model: before :meth:`run` without training, then the best restart's.
     :ivar check: how far the engines are apart, once :meth:`check_engines` has compared them.
     :ivar stopped: the restarts that were stopped early, with their epochs of the last stage.
-    :ivar agreement: the NMI of the other restarts' segments with the best restart's, once :meth:`run` has compared
-        them: of the training demonstrations, at the lowest level.
+    :ivar agreement: the NMI of the other restarts' segments with the best restart's, once :meth:`run` has
+        compared them: of the training demonstrations, at the lowest level.
 
     :param checkpoints: the folder for a checkpoint of each restart; None for nowhere.
-    :param jobs: processes that train restarts side by side, each a whole one; -1 is one for each core. The result is
-        the same for any number. Under ``torchrun`` its processes train each restart together (:func:`follow`).
+    :param jobs: processes that train restarts side by side, each a whole one; -1 is one for each core. The
+        result is the same for any number. Under ``torchrun`` its processes train each restart together
+        (:func:`follow`).
     :param library: the prior that the spec's ``training.library`` is.
     :raises DemonstrationsError: a number is too large for networks.
-    :raises SpecError: the demonstrations lack the labels that the spec names, or have more labels than options.
+    :raises SpecError: the demonstrations lack the labels that the spec names, or have more labels than
+        options.
     """
 
     def __init__(
@@ -172,7 +175,8 @@ class Trainer:
     def check_engines(self) -> None:
         """Compare the engines before any training, on a few of the training demonstrations.
 
-        EM's log-prior of a library is compared with that of the Pyro program, at random weights and at the library's.
+        EM's log-prior of a library is compared with that of the Pyro program, at random weights and at the
+        library's.
 
         :raises TrainingError: they disagree, or a network gives values that are not finite.
         """
@@ -202,12 +206,17 @@ class Trainer:
         def score(tables: Tables, piece: Batch, rows: torch.Tensor) -> torch.Tensor:
             return log_likelihood(tables, piece.lengths).sum()
 
-        models = self.hierarchy, self.data.hierarchy(0, {**self.hierarchy.state_dict(), **copy_of(library.model)})
+        models = (
+            self.hierarchy,
+            self.data.hierarchy(0, {**self.hierarchy.state_dict(), **copy_of(library.model)}),
+        )
         ridge = self.spec.training.optimizer.ridge
         by_em = [Expectation(one, EVERYTHING, score, ridge, prior=library).log_prior(batch) for one in models]
         with torch.no_grad():
             by_program = [float(library.log_density(one)) for one in models]
-        return abs(by_em[1] - by_em[0] - by_program[1] + by_program[0]) / max(1.0, abs(by_program[1] - by_program[0]))
+        return abs(by_em[1] - by_em[0] - by_program[1] + by_program[0]) / max(
+            1.0, abs(by_program[1] - by_program[0])
+        )
 
     def run(self) -> Hierarchy:
         """Train, and return the best restart's hierarchy in evaluation mode.
@@ -234,9 +243,9 @@ class Trainer:
     def contain(self, mixture: Hierarchy, objective: float) -> Hierarchy:
         """Keep no model that is less likely in training than a mixture which the hierarchy contains.
 
-        Where no restart is as likely, EM goes on from the mixture: first with options that last, then with ψ nearly 1,
-        where they are as likely as the mixture from the first step on. Gradient steps do not go on, since they would
-        take more than the mixture's budget.
+        Where no restart is as likely, EM goes on from the mixture: first with options that last, then with ψ
+        nearly 1, where they are as likely as the mixture from the first step on. Gradient steps do not go on,
+        since they would take more than the mixture's budget.
 
         :param mixture: networks of the same spec, whose options end after every step.
         :param objective: of the mixture, nats per step of the same demonstrations.
@@ -257,7 +266,9 @@ class Trainer:
         model = self.data.hierarchy(number)
         model.begin_terminations(logit)
         begun = Progress(number, stage=self._last(number), device=described(device_of(self.spec.training)))
-        self.restarts.append(self._begun(number, Restart(begun, {"model": copy_of(model) | copy_of(mixture)})))
+        self.restarts.append(
+            self._begun(number, Restart(begun, {"model": copy_of(model) | copy_of(mixture)}))
+        )
         with self._together():
             self._train([number])
 
@@ -265,9 +276,13 @@ class Trainer:
         if len(self.restarts) > 1 and self.hierarchy.depth:
             from sklearn.metrics import normalized_mutual_info_score
 
-            found = {n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states}
+            found = {
+                n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states
+            }
             own = found.pop(self.best)
-            self.agreement = {n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()}
+            self.agreement = {
+                n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()
+            }
         self.hierarchy.load_state_dict(self.restarts[self.best].states["best"])
         return self.hierarchy.place(device_of(self.spec.training)).eval()
 
@@ -356,7 +371,9 @@ class Trainer:
         model = self.data.hierarchy(number, self.restarts[number].states["best"])
         with torch.no_grad():
             pieces = (piece for _, piece in self.data.train.pieces(model.steps_at_once))
-            found = [segment(model.recognised(model.tabulate(piece), piece), piece.lengths)[0] for piece in pieces]
+            found = [
+                segment(model.recognised(model.tabulate(piece), piece), piece.lengths)[0] for piece in pieces
+            ]
         return torch.cat([choices[choices >= 0] for choices in found]).numpy()
 
     def _last(self, number: int) -> int:

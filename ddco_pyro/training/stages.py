@@ -1,7 +1,7 @@
 """The stages of training (SM 2.2, SM 2.3): what each trains, its share of the budget, and how it ended.
 
-``training.epochs`` is a budget for all stages together, so that models compared have the same number of gradient steps
-whatever their number of stages.
+``training.epochs`` is a budget for all stages together, so that models compared have the same number of
+gradient steps whatever their number of stages.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ class Stage:
     :param trained: prefixes of the names of the parameters that are trained.
     :param selecting: train the meta-policy on the clamped choices, beside the levels under a uniform one.
     :param from_constants: train the networks to :class:`ddco_pyro.training.upper.Constants`.
-    :param memoryless: every option ends after every step (ψ = 1); the networks of ψ start at ψ = 1/2 in later stages.
+    :param memoryless: every option ends after every step (ψ = 1); the networks of ψ start at ψ = 1/2 in later
+        stages.
     """
 
     name: str
@@ -72,7 +73,9 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
         networks = networks if level > 1 else ("trunk.", *networks)
         if way.stage:
             name = f"{way.stage}-{level}"
-            if level == depth and not layerwise and not acts:  # clamped choices do not show when it acts itself
+            if (
+                level == depth and not layerwise and not acts
+            ):  # clamped choices do not show when it acts itself
                 trained = (*networks, "meta_policy.")
                 stages.append(Stage(name, None, level, trained, selecting=True, memoryless=mixed))
             else:
@@ -97,8 +100,8 @@ def stage_end(
     """The end of a stage of training, as :class:`ddco_pyro.metrics.Stage`.
 
     ``rising`` are the nats per step by which the best tuning value rose over the last ``over`` epochs
-    (``training.patience``, or all epochs where there are fewer): 0 where patience ended the stage, or at an optimum.
-    The stage ``converged`` where it had epochs, and rose by at most :data:`RISING`.
+    (``training.patience``, or all epochs where there are fewer): 0 where patience ended the stage, or at an
+    optimum. The stage ``converged`` where it had epochs, and rose by at most :data:`RISING`.
 
     :param cap: the epochs that the stage might take; None for no limit.
     :param tune: tuning values before the stage, and of each epoch.
@@ -107,7 +110,14 @@ def stage_end(
     over = min(patience or WINDOW, epochs)
     rising = 0.0 if at_optimum else max(tune) - max(tune[: epochs - over + 1])
     converged = epochs > 0 and rising <= RISING
-    return {"stage": stage, "epochs": epochs, "cap": cap, "rising": rising, "over": over, "converged": converged}
+    return {
+        "stage": stage,
+        "epochs": epochs,
+        "cap": cap,
+        "rising": rising,
+        "over": over,
+        "converged": converged,
+    }
 
 
 def share(budget: int | None, spent: int, stages_left: int) -> int | None:

@@ -1,10 +1,10 @@
 """Initialisation of the levels above the lowest, from which options of the lowest level follow each other.
 
-An option above the lowest level shows in its sequence of selections, not in a single step. An AHMM is therefore fitted
-whose selections, and terminations above the lowest level, do not depend on the state: a hierarchical hidden Markov
-model (Fine, Singer, Tishby 1998) above the trained lowest level. EM (Baum et al. 1970) is exact in this model: the
-E-step is the elimination, the M-step divides expected counts. The result depends on the start, so the likeliest of many
-random starts is kept.
+An option above the lowest level shows in its sequence of selections, not in a single step. An AHMM is
+therefore fitted whose selections, and terminations above the lowest level, do not depend on the state: a
+hierarchical hidden Markov model (Fine, Singer, Tishby 1998) above the trained lowest level. EM (Baum et al.
+1970) is exact in this model: the E-step is the elimination, the M-step divides expected counts. The result
+depends on the start, so the likeliest of many random starts is kept.
 """
 
 from __future__ import annotations
@@ -73,7 +73,11 @@ class Constants:
     def state(self) -> dict[str, Tensor]:
         """The constants as tensors by name."""
         parts = {"selection": self.selection, "termination": self.termination}
-        return {f"{kind}.{number:03}": table for kind, tables in parts.items() for number, table in enumerate(tables)}
+        return {
+            f"{kind}.{number:03}": table
+            for kind, tables in parts.items()
+            for number, table in enumerate(tables)
+        }
 
     def within(self, tables: Tables) -> Tables:
         """The tables with these probabilities in place of the networks'; no caller emits the control."""
@@ -81,15 +85,17 @@ class Constants:
         for level, chosen in enumerate(self.selection):
             selection[level] = pad(chosen.log(), (1, 0), value=NEVER).expand(tables.selection[level].shape)
         for level, ended in enumerate(self.termination, start=1):
-            termination[level] = torch.stack([1 - ended, ended], -1).log().expand(tables.termination[level].shape)
+            termination[level] = (
+                torch.stack([1 - ended, ended], -1).log().expand(tables.termination[level].shape)
+            )
         return replace(tables, selection=tuple(selection), termination=tuple(termination))
 
 
 def fitted(pieces: Sequence[Piece], seed: int) -> Constants:
     """The likeliest constants that EM finds from :data:`STARTS` random ones.
 
-    :param pieces: tables of all demonstrations; only the shapes of their selections, and of their terminations above
-        the lowest level, are used.
+    :param pieces: tables of all demonstrations; only the shapes of their selections, and of their
+        terminations above the lowest level, are used.
     """
     random = np.random.default_rng(seed)
     left, iterations = [Constants.drawn(pieces[0][0], random) for _ in range(STARTS)], FIRST
@@ -100,7 +106,9 @@ def fitted(pieces: Sequence[Piece], seed: int) -> Constants:
     return _run(pieces, left[0], MOST, CONVERGED * steps)[1]
 
 
-def _run(pieces: Sequence[Piece], constants: Constants, iterations: int, least: float) -> tuple[float, Constants]:
+def _run(
+    pieces: Sequence[Piece], constants: Constants, iterations: int, least: float
+) -> tuple[float, Constants]:
     """Iterate EM while an iteration gains ``least`` nats; the last log-likelihood, and the constants."""
     value = -np.inf
     for _ in range(iterations):
@@ -114,7 +122,9 @@ def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Cons
     """An iteration of EM: the log-likelihood of the constants, and the next constants."""
     value = 0.0
     selected = [torch.full_like(table, PSEUDO) for table in constants.selection]
-    ended = [torch.stack([PSEUDO * (psi < 1), torch.full_like(psi, PSEUDO)], -1) for psi in constants.termination]
+    ended = [
+        torch.stack([PSEUDO * (psi < 1), torch.full_like(psi, PSEUDO)], -1) for psi in constants.termination
+    ]
     for tables, lengths in pieces:
         posterior = fused.posteriors(constants.within(tables), lengths)
         value += float(posterior.value.sum())
@@ -129,8 +139,8 @@ def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Cons
 def expected(tables: Tables, lengths: Tensor, constants: Constants) -> Tensor:
     """The expected log-probability E[log p(ζ_n)] of each trajectory, nats, [N] in float64.
 
-    An M-step of the networks maximises their sum. The log-probability is that of selections, and of terminations above
-    the lowest level. The expectation is over the posterior of ζ_n given the constants.
+    An M-step of the networks maximises their sum. The log-probability is that of selections, and of
+    terminations above the lowest level. The expectation is over the posterior of ζ_n given the constants.
     """
     counts, tables = fused.posteriors(constants.within(tables), lengths).tables, tables.normalised()
     pairs = [

@@ -39,11 +39,14 @@ class DDCOPolicy(PreTrainedPolicy):
     ) -> Self:
         """The policy of a folder on this machine.
 
-        :raises ValueError: there is no exported controller. Nothing is downloaded, since its code is executed.
+        :raises ValueError: there is no exported controller. Nothing is downloaded, since its code is
+            executed.
         """
         folder = Path(pretrained_name_or_path)
         if not (folder / "runner.py").is_file():
-            raise ValueError(f"{folder}: has no runner.py; export one with: ddco-pyro export RUN --lerobot FOLDER")
+            raise ValueError(
+                f"{folder}: has no runner.py; export one with: ddco-pyro export RUN --lerobot FOLDER"
+            )
         return cls(config or PreTrainedConfig.from_pretrained(folder), folder).eval()
 
     def reset(self) -> None:

@@ -22,7 +22,9 @@ def make_ddco_pre_post_processors(
     """The controller scales by itself, so statistics of a dataset are not used."""
     before = [RenameObservationsProcessorStep(rename_map={}), AddBatchDimensionProcessorStep()]
     return (
-        PolicyProcessorPipeline([*before, DeviceProcessorStep(device=config.device)], name="policy_preprocessor"),
+        PolicyProcessorPipeline(
+            [*before, DeviceProcessorStep(device=config.device)], name="policy_preprocessor"
+        ),
         PolicyProcessorPipeline(
             [DeviceProcessorStep(device="cpu")],
             name="policy_postprocessor",

@@ -1,8 +1,9 @@
-"""Grasp candidates in a mask: points on what is seen, each with a direction, and a classifier that scores them.
+"""Grasp candidates in a mask: points on what is seen, each with a direction, and a classifier that scores
+them.
 
-The classifier is a logistic regression over how the mask looks in the frame of the gripper, so its weights are a few
-numbers. ``grasp_classifier.json`` holds them; ``studies/bin_picking_candidates.py`` of commit 6b4a34a made it from 40
-labelled images.
+The classifier is a logistic regression over how the mask looks in the frame of the gripper, so its weights
+are a few numbers. ``grasp_classifier.json`` holds them; ``studies/bin_picking_candidates.py`` of commit
+6b4a34a made it from 40 labelled images.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ AXIS_RADIUS = 10  # pixels about a point that say in which direction the wire ru
 CENTRE_RADIUS = 4  # pixels about a point whose centre is taken for the wire's axis
 PIXELS_PER_METRE = FOCAL_LENGTH / CAMERA_HEIGHT
 
-# The patch that is looked at: cells of half a millimetre across the jaws and along the wire, averaged over both mirror
-# images (the jaws are symmetric) and over blocks of cells.
+# The patch that is looked at: cells of half a millimetre across the jaws and along the wire, averaged over
+# both mirror images (the jaws are symmetric) and over blocks of cells.
 CELL = 0.0005
 ACROSS, ALONG = 20, 12
 BLOCK = 2

@@ -1,8 +1,8 @@
-"""The forms of a control: joint angles, or the gripper's pose in one of two representations (SM 1.4, "Coordinate
-Systems").
+"""The forms of a control: joint angles, or the gripper's pose in one of two representations (SM 1.4,
+"Coordinate Systems").
 
-Each says where the arm is to go in terms of what its encoders are to read, and ends with the jaw. A pose is that of
-``kin``: what kinematics make of the encoders, which is not where the gripper truly goes.
+Each says where the arm is to go in terms of what its encoders are to read, and ends with the jaw. A pose is
+that of ``kin``: what kinematics make of the encoders, which is not where the gripper truly goes.
 """
 
 from __future__ import annotations
@@ -19,13 +19,16 @@ from ddco_pyro.simulation.task import Observation, Policy
 
 from .. import psm
 
-REACH = 1e3 * (psm.JOINT_RANGES[2, 1] + psm.WRIST_LENGTH + psm.JAW_LENGTH)  # mm, from the remote centre of motion
+REACH = 1e3 * (
+    psm.JOINT_RANGES[2, 1] + psm.WRIST_LENGTH + psm.JAW_LENGTH
+)  # mm, from the remote centre of motion
 JAW = "jaw"
 
 
 @dataclass(frozen=True)
 class Controls:
-    """A form of controls [A]: numbers [A - 1] that say what the encoders of the joints are to read, and the jaw.
+    """A form of controls [A]: numbers [A - 1] that say what the encoders of the joints are to read, and the
+    jaw.
 
     :param names: of the numbers.
     :param ranges: least and greatest of each, [A - 1, 2].
@@ -41,7 +44,9 @@ class Controls:
     def spec(self) -> specs.BoundedArray:
         """Of a control [A]; the jaw opens above one half and closes otherwise."""
         limits = np.vstack([self.ranges, [0.0, 1.0]])
-        return specs.BoundedArray((len(limits),), float, limits[:, 0], limits[:, 1], name=",".join((*self.names, JAW)))
+        return specs.BoundedArray(
+            (len(limits),), float, limits[:, 0], limits[:, 1], name=",".join((*self.names, JAW))
+        )
 
     def joints(self, control: np.ndarray) -> np.ndarray:
         """The joints [6] of a control [A], each within its limits; NaN where there are none."""
@@ -59,7 +64,10 @@ class Scripted:
     """A scripted policy of joint angles whose controls are given in a form."""
 
     def __init__(
-        self, policy: Callable[[dm_env.Environment], Policy], controls: Controls, environment: dm_env.Environment
+        self,
+        policy: Callable[[dm_env.Environment], Policy],
+        controls: Controls,
+        environment: dm_env.Environment,
     ) -> None:
         self._policy, self._controls = policy(environment), controls
 
@@ -100,7 +108,9 @@ def _of_matrix(numbers: np.ndarray) -> np.ndarray:
 
 def _to_matrix(joints: np.ndarray) -> np.ndarray:
     pose = psm.forward(joints)
-    return np.concatenate([pose.position * 1e3, pose.rotation.ravel().clip(-1, 1)])  # rounding may lead beyond
+    return np.concatenate(
+        [pose.position * 1e3, pose.rotation.ravel().clip(-1, 1)]
+    )  # rounding may lead beyond
 
 
 _POSITION = np.stack([1e3 * psm.RCM - REACH, 1e3 * psm.RCM + REACH], axis=1)

@@ -1,10 +1,10 @@
 """Surgical bin picking: clear a foam bin of tangled pins, suturing needles and wires, each into its cup.
 
-After the paper's second physical experiment (Physical Experiment 2 and SM 1.4). A da Vinci-like arm with inexact
-encoders takes objects out of a bin, one grasp after another; in each control step it is given six joint angles, or a
-pose of the gripper, and the jaw, moves there and settles. It is seen through its encoders and through a stereo pair
-650 mm above the bin. An episode is a whole bin. Simulated lengths are metres; what is observed is in millimetres and
-pixels.
+After the paper's second physical experiment (Physical Experiment 2 and SM 1.4). A da Vinci-like arm with
+inexact encoders takes objects out of a bin, one grasp after another; in each control step it is given six
+joint angles, or a pose of the gripper, and the jaw, moves there and settles. It is seen through its encoders
+and through a stereo pair 650 mm above the bin. An episode is a whole bin. Simulated lengths are metres; what
+is observed is in millimetres and pixels.
 """
 
 from __future__ import annotations
@@ -36,8 +36,12 @@ from .trials import MOST_STEPS, Attempt, End, Trials, most_attempts
 
 HERE = Path(__file__).parent
 FEWEST, MOST = 3, 8  # objects in a bin
-REPEATABILITY = np.array([6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3])  # rad, m: standard deviations, 0.2 mm at the gripper
-JAW_ERROR = 0.01  # rad: standard deviation of the angle that the jaws' encoder reads, as the backlash of the wrist
+REPEATABILITY = np.array(
+    [6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3]
+)  # rad, m: standard deviations, 0.2 mm at the gripper
+JAW_ERROR = (
+    0.01  # rad: standard deviation of the angle that the jaws' encoder reads, as the backlash of the wrist
+)
 LIFTED_HEIGHT = 0.018  # m: a gripper above this has lifted what it holds
 BIN_SEEN = in_bin(lying_at(np.stack(np.meshgrid(*2 * [np.arange(IMAGE_SIZE, dtype=float)]), axis=-1)))
 FRAME_SIZE = (360, 480)
@@ -47,11 +51,13 @@ SHARED_SOURCES = ("arm.py", "psm.py", "rendering.py", "vision.py")
 class BinPicking(base.Task):
     """Starts, observes and rewards an episode; ``controls`` is the form of its controls.
 
-    ``trials`` has what became of the attempts; of the trial at hand, ``remaining`` are the objects that were in no cup
-    when it began, and ``lifted`` those that the jaws first lifted, None before.
+    ``trials`` has what became of the attempts; of the trial at hand, ``remaining`` are the objects that were
+    in no cup when it began, and ``lifted`` those that the jaws first lifted, None before.
     """
 
-    def __init__(self, kinds: Sequence[str], random: np.random.RandomState, controls: Controls = JOINTS) -> None:
+    def __init__(
+        self, kinds: Sequence[str], random: np.random.RandomState, controls: Controls = JOINTS
+    ) -> None:
         super().__init__(random=random)
         self.controls = controls
         self.trials = Trials(kinds)
@@ -77,8 +83,8 @@ class BinPicking(base.Task):
         self._next_candidate()
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
-        """Set points [A]: what the encoders are to read, in the form of the task's controls, and the jaw, which opens
-        above one half and closes otherwise.
+        """Set points [A]: what the encoders are to read, in the form of the task's controls, and the jaw,
+        which opens above one half and closes otherwise.
         """
         del physics
         return self.controls.spec()
@@ -108,9 +114,13 @@ class BinPicking(base.Task):
 
     def _end_trial(self, physics: Physics, released: bool) -> None:
         places, lifted = physics.places(), self.lifted or frozenset()
-        held = (self._held if released else physics.held()) & (self.remaining | lifted)  # not what lies in a cup
+        held = (self._held if released else physics.held()) & (
+            self.remaining | lifted
+        )  # not what lies in a cup
         where = [places[number] for number in sorted(held)] or [physics.gripper_place()]
-        self.trials.add(Attempt(len(self.remaining), lifted, held, tuple(where) if released else (), self.trials.steps))
+        self.trials.add(
+            Attempt(len(self.remaining), lifted, held, tuple(where) if released else (), self.trials.steps)
+        )
         self.lifted = None
         self.remaining = frozenset(number for number, place in enumerate(places) if place not in CUPS)
         if not self.remaining:
@@ -133,12 +143,12 @@ class BinPicking(base.Task):
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
         """What cameras and encoders tell.
 
-        ``image`` uint8 [72, 72, 2]: masks of the objects, 0 and 255, of the left and the right eye; ``grasp`` [6]: the
-        trial's candidate, column and row (pixels of 288) in the left and the right picture, cosine and sine of the
-        gripper's turn; ``kin`` [7]: position (mm) and rotation vector (rad) of the gripper as the encoders give them,
-        with kinematic error, and the angle between the jaws (rad), which objects between them keep from closing;
-        ``load`` [18]: the shape of what the left mask, as it was rendered, has where loads are shown
-        (:func:`ddco_tasks.bin_picking.shape.described`).
+        ``image`` uint8 [72, 72, 2]: masks of the objects, 0 and 255, of the left and the right eye; ``grasp``
+        [6]: the trial's candidate, column and row (pixels of 288) in the left and the right picture, cosine
+        and sine of the gripper's turn; ``kin`` [7]: position (mm) and rotation vector (rad) of the gripper as
+        the encoders give them, with kinematic error, and the angle between the jaws (rad), which objects
+        between them keep from closing; ``load`` [18]: the shape of what the left mask, as it was rendered,
+        has where loads are shown (:func:`ddco_tasks.bin_picking.shape.described`).
         """
         reported = psm.forward(physics.encoders())
         turn = psm.rotation_vector(reported.rotation)
@@ -190,13 +200,16 @@ def frame(environment: dm_env.Environment) -> np.ndarray:
 def load(
     seed: int, instrument: int = 1, controls: Controls = JOINTS, kinds: Sequence[str] | None = None
 ) -> Environment:
-    """A fresh environment whose objects and episodes depend on the seed alone, with the instrument of that number.
+    """A fresh environment whose objects and episodes depend on the seed alone, with the instrument of that
+    number.
 
     :param kinds: of the objects; drawn where they are not given.
     """
     random = np.random.RandomState(seed)
     if kinds is None:
-        kinds = [KINDS[number] for number in random.randint(len(KINDS), size=random.randint(FEWEST, MOST + 1))]
+        kinds = [
+            KINDS[number] for number in random.randint(len(KINDS), size=random.randint(FEWEST, MOST + 1))
+        ]
     physics = Physics.from_xml_string(scene(HERE / "bin_picking.xml", kinds))
     physics.instrument = Instrument.numbered(instrument)
     sub_steps = round((MOVE_TIME + SETTLE_TIME) / physics.timestep())

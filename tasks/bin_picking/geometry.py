@@ -1,4 +1,5 @@
-"""Where things are: bin, cups, the places of a trial's way points, and the pixels of the overhead stereo pair.
+"""Where things are: bin, cups, the places of a trial's way points, and the pixels of the overhead stereo
+pair.
 
 Metres and radians; pixels are counted from the centre of the upper left one. The world's origin is on the
 bin's floor, between the cups; x points towards the reject cup, y away from the arm.
@@ -68,4 +69,6 @@ def place_of(position: np.ndarray) -> str:
     """Where a point [3] is: ``bin``, ``accept``, ``reject``, or ``outside`` of all of them."""
     if in_bin(position):
         return "bin"
-    return next((name for name, cup in CUPS.items() if np.all(np.abs(position[:2] - cup) < CUP_INSIDE)), "outside")
+    return next(
+        (name for name, cup in CUPS.items() if np.all(np.abs(position[:2] - cup) < CUP_INSIDE)), "outside"
+    )

@@ -1,8 +1,9 @@
 """An instrument in the arm: a bias of its own in every joint, and backlash of its cables.
 
-Beside the smooth error of :func:`ddco_tasks.psm.encoder_error`, which the arm has with any instrument, the joints of a
-da Vinci depend on the instrument that is mounted and on the direction in which they last moved. Motors are what is
-commanded and read; joints are what moves the gripper. Units are those of the joints: rad, and m for the insertion.
+Beside the smooth error of :func:`ddco_tasks.psm.encoder_error`, which the arm has with any instrument, the
+joints of a da Vinci depend on the instrument that is mounted and on the direction in which they last moved.
+Motors are what is commanded and read; joints are what moves the gripper. Units are those of the joints: rad,
+and m for the insertion.
 """
 
 from __future__ import annotations
@@ -40,13 +41,16 @@ class Instrument:
         return psm.encoder_readings(joints - self.bias) + slack
 
     def command(self, joints: np.ndarray, motors: np.ndarray, slack: np.ndarray) -> np.ndarray:
-        """The motors' set points [6] that bring the joints to ``joints`` [6] from ``motors`` and ``slack`` [6].
+        """The motors' set points [6] that bring the joints to ``joints`` [6] from ``motors`` and ``slack``
+        [6].
 
-        A motor has to run ahead of its joint in the direction in which the joint is to move; where the joint is to stay
-        the motor does.
+        A motor has to run ahead of its joint in the direction in which the joint is to move; where the joint
+        is to stay the motor does.
         """
         wanted = self.motors(joints, np.zeros(6))
-        return wanted + np.where(wanted == motors - slack, slack, BACKLASH * np.sign(wanted - (motors - slack)))
+        return wanted + np.where(
+            wanted == motors - slack, slack, BACKLASH * np.sign(wanted - (motors - slack))
+        )
 
 
 def slack_after(slack: np.ndarray, move: np.ndarray) -> np.ndarray:

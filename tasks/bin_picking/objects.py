@@ -1,8 +1,9 @@
-"""What lies in the bin: dissection pins, suturing needles and wires; and four kinds that no demonstration has shown.
+"""What lies in the bin: dissection pins, suturing needles and wires; and four kinds that no demonstration has
+shown.
 
-All but the thread are rigid chains of capsules and cylinders. The thread is a chain of links with joints between them,
-which keep the shape it has on the spool, but softly. An object's frame has its origin in the middle of the object and x
-along it; lengths are metres.
+All but the thread are rigid chains of capsules and cylinders. The thread is a chain of links with joints
+between them, which keep the shape it has on the spool, but softly. An object's frame has its origin in the
+middle of the object and x along it; lengths are metres.
 """
 
 from __future__ import annotations
@@ -20,13 +21,27 @@ ACCEPTED = "pin"
 DENSITY = 7800.0  # kg/m³, of steel
 
 PIN_LENGTH, PIN_RADIUS, HEAD_RADIUS = 0.024, 0.0005, 0.0015
-NEEDLE_ARC_RADIUS, NEEDLE_HALF_ANGLE, NEEDLE_RADIUS = 0.009, np.deg2rad(67.5), 0.0006  # three eighths of a circle
+NEEDLE_ARC_RADIUS, NEEDLE_HALF_ANGLE, NEEDLE_RADIUS = (
+    0.009,
+    np.deg2rad(67.5),
+    0.0006,
+)  # three eighths of a circle
 NEEDLE_PARTS = 6
 WIRE_LENGTH, WIRE_BEND, WIRE_RADIUS = 0.027, np.deg2rad(40.0), 0.001  # three equal parts, bent to either side
 
-DIODE_LENGTH, DIODE_RADIUS, LEADS_LENGTH, LEAD_RADIUS = 0.005, 0.0013, 0.026, 0.0005  # as a DO-41, its leads straight
+DIODE_LENGTH, DIODE_RADIUS, LEADS_LENGTH, LEAD_RADIUS = (
+    0.005,
+    0.0013,
+    0.026,
+    0.0005,
+)  # as a DO-41, its leads straight
 NAIL_LENGTH, NAIL_RADIUS, NAIL_HEAD_LENGTH, NAIL_HEAD_RADIUS = 0.030, 0.0010, 0.0012, 0.0024
-SCREW_LENGTH, SCREW_RADIUS, SCREW_HEAD_LENGTH, SCREW_HEAD_RADIUS = 0.016, 0.0015, 0.0022, 0.0028  # M3 with its head
+SCREW_LENGTH, SCREW_RADIUS, SCREW_HEAD_LENGTH, SCREW_HEAD_RADIUS = (
+    0.016,
+    0.0015,
+    0.0022,
+    0.0028,
+)  # M3 with its head
 THREAD_LENGTH, THREAD_RADIUS, THREAD_LINKS = 0.028, 0.0005, 9
 THREAD_BEND = np.deg2rad(24.0)  # from link to link, as it comes from the spool
 THREAD_STIFFNESS, THREAD_DAMPING, THREAD_ARMATURE = 2e-6, 2e-7, 2e-9  # of a joint: N·m/rad, N·m·s/rad, kg·m²
@@ -67,12 +82,16 @@ def parts(kind: str) -> list[Part]:
 def _turned(edges: Sequence[float], radii: Sequence[float]) -> list[Part]:
     """Cylinders along x, one after another."""
     ends = [np.array([edge, 0.0, 0.0]) for edge in edges]
-    return [Part(*pair, radius, "cylinder") for pair, radius in zip(itertools.pairwise(ends), radii, strict=True)]
+    return [
+        Part(*pair, radius, "cylinder") for pair, radius in zip(itertools.pairwise(ends), radii, strict=True)
+    ]
 
 
 def _arc() -> np.ndarray:
     angles = np.linspace(-NEEDLE_HALF_ANGLE, NEEDLE_HALF_ANGLE, NEEDLE_PARTS + 1)
-    corners = NEEDLE_ARC_RADIUS * np.stack([np.sin(angles), 1.0 - np.cos(angles), np.zeros_like(angles)], axis=1)
+    corners = NEEDLE_ARC_RADIUS * np.stack(
+        [np.sin(angles), 1.0 - np.cos(angles), np.zeros_like(angles)], axis=1
+    )
     return corners - corners.mean(axis=0) * [0.0, 1.0, 0.0]
 
 
@@ -87,7 +106,9 @@ def _loop() -> np.ndarray:
     """A curve that is bent to one side in its first half and to the other one in its second half."""
     links = np.arange(THREAD_LINKS) - THREAD_LINKS // 2
     headings = THREAD_BEND * (np.abs(links) - np.abs(links).mean())
-    steps = THREAD_LENGTH / THREAD_LINKS * np.stack([np.cos(headings), np.sin(headings), 0.0 * headings], axis=1)
+    steps = (
+        THREAD_LENGTH / THREAD_LINKS * np.stack([np.cos(headings), np.sin(headings), 0.0 * headings], axis=1)
+    )
     corners = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     return corners - (corners[THREAD_LINKS // 2] + corners[THREAD_LINKS // 2 + 1]) / 2
 

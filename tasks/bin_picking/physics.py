@@ -47,7 +47,9 @@ class Physics(ArmPhysics):
     @property
     def objects(self) -> int:
         """How many objects there are, in the bin or out of it."""
-        return sum(1 for name in range(self.model.nbody) if self.model.id2name(name, "body").startswith("object_"))
+        return sum(
+            1 for name in range(self.model.nbody) if self.model.id2name(name, "body").startswith("object_")
+        )
 
     def place_arm(self, joints: np.ndarray, jaw: float) -> None:
         """Put the arm at true joints [6] and the jaws at an angle (rad), at rest."""
@@ -84,8 +86,8 @@ class Physics(ArmPhysics):
         return self.instrument.command(joints, self.motors, self.slack)
 
     def move_to(self, motors: np.ndarray, jaw: float, noise: np.ndarray) -> None:
-        """Set the goal of the next control step: motors [6] and the angle between the jaws (rad). Where the motors are
-        not finite the arm stays where it was, and the simulation is ``unstable``.
+        """Set the goal of the next control step: motors [6] and the angle between the jaws (rad). Where the
+        motors are not finite the arm stays where it was, and the simulation is ``unstable``.
 
         :param noise: added to the joints [6], by which a move is not quite repeatable.
         """

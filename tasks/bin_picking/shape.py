@@ -7,9 +7,15 @@ import numpy as np
 
 from .geometry import SHOWING, project
 
-HALF_HEIGHT, HALF_WIDTH = 52, 112  # pixels about the place where loads are shown; the rows begin at the picture's edge
+HALF_HEIGHT, HALF_WIDTH = (
+    52,
+    112,
+)  # pixels about the place where loads are shown; the rows begin at the picture's edge
 COLUMN, ROW = np.round(project(SHOWING)).astype(int)
-REGION = (slice(max(0, ROW - HALF_HEIGHT), ROW + HALF_HEIGHT), slice(COLUMN - HALF_WIDTH, COLUMN + HALF_WIDTH))
+REGION = (
+    slice(max(0, ROW - HALF_HEIGHT), ROW + HALF_HEIGHT),
+    slice(COLUMN - HALF_WIDTH, COLUMN + HALF_WIDTH),
+)
 FEWEST = 4  # pixels; fewer have no shape
 NAMES = (
     "area", "inside", "parts", "largest part", "spread across", "spread along", "hull", "length", "width", "outline",
@@ -24,12 +30,13 @@ def load_of(left: np.ndarray) -> np.ndarray:
 
 
 def described(mask: np.ndarray) -> np.ndarray:
-    """The shape of what is not 0 in a mask uint8 [H, W]: numbers [18] in pixels (:data:`NAMES`), 0 where hardly any is.
+    """The shape of what is not 0 in a mask uint8 [H, W]: numbers [18] in pixels (:data:`NAMES`), 0 where
+    hardly any is.
 
-    Its pixels, those that have neighbours above, to the left and between, how many parts it has, and the pixels of the
-    largest; standard deviations along its principal axes; the area of its convex hull, the sides of the smallest
-    rectangle about it and the length of its outlines; its pixels over the hull's area; centre, extent, and the sine of
-    the angle between its longer principal axis and the rows.
+    Its pixels, those that have neighbours above, to the left and between, how many parts it has, and the
+    pixels of the largest; standard deviations along its principal axes; the area of its convex hull, the
+    sides of the smallest rectangle about it and the length of its outlines; its pixels over the hull's area;
+    centre, extent, and the sine of the angle between its longer principal axis and the rows.
     """
     rows, columns = np.nonzero(mask)
     if len(rows) < FEWEST:

@@ -1,8 +1,8 @@
 """Scripted policies of bin picking: the open-loop plan of a trial, and the supervisor that corrects it.
 
-The paper's demonstrations came from an open-loop policy that a person interrupted when it was about to fail; the
-adjustment was carried on. A key let the robot stop in place and drop what it held where that was nothing or several
-objects. Here the person is replaced by a corrector that sees the true state.
+The paper's demonstrations came from an open-loop policy that a person interrupted when it was about to fail;
+the adjustment was carried on. A key let the robot stop in place and drop what it held where that was nothing
+or several objects. Here the person is replaced by a corrector that sees the true state.
 """
 
 from __future__ import annotations
@@ -118,13 +118,15 @@ class OpenLoop:
 class Supervisor(OpenLoop):
     """The open-loop plan with corrections that are carried on, and with recovery.
 
-    Before each step it predicts where the next way point would really bring the gripper. Where that is further from the
-    way point than an operator would let pass, it changes the motors' set points by what removes the difference, from
-    here on. What it holds decides what follows: one object is carried to its cup; with none or several the arm goes
-    back over the bin and the jaws open, and the next trial starts from there.
+    Before each step it predicts where the next way point would really bring the gripper. Where that is
+    further from the way point than an operator would let pass, it changes the motors' set points by what
+    removes the difference, from here on. What it holds decides what follows: one object is carried to its
+    cup; with none or several the arm goes back over the bin and the jaws open, and the next trial starts from
+    there.
 
-    As with a person, what it does is coarser than what it means to do. ``intended`` is the control it meant, which is
-    recorded: demonstrations show how to come back from an inexact move without teaching the inexactness.
+    As with a person, what it does is coarser than what it means to do. ``intended`` is the control it meant,
+    which is recorded: demonstrations show how to come back from an inexact move without teaching the
+    inexactness.
     """
 
     def __init__(self, environment: dm_env.Environment) -> None:
@@ -154,11 +156,15 @@ class Supervisor(OpenLoop):
 
     @property
     def annotations(self) -> dict[str, int]:
-        """Besides the phase, before the step just decided: how many objects were ``held``, the ``kind`` of a single one
-        (-1 otherwise), and how many were ``left`` in the bin when the trial began.
+        """Besides the phase, before the step just decided: how many objects were ``held``, the ``kind`` of a
+        single one (-1 otherwise), and how many were ``left`` in the bin when the trial began.
         """
         kind = (KINDS + UNSEEN).index(self._kinds[min(self._held)]) if len(self._held) == 1 else -1
-        return super().annotations | {"held": len(self._held), "kind": kind, "left": len(self._task.remaining)}
+        return super().annotations | {
+            "held": len(self._held),
+            "kind": kind,
+            "left": len(self._task.remaining),
+        }
 
     def _rest(self) -> list[WayPoint]:
         if len(self._held) != 1:
@@ -168,7 +174,9 @@ class Supervisor(OpenLoop):
     def _by_hand(self, way_point: WayPoint) -> Pose:
         """The gripper pose that a person achieves who wants another one."""
         height = max(0.0, way_point.pose.position[2] - GRASP_HEIGHT)
-        spread = HAND_POSITION[way_point.tolerance] + HAND_HEIGHT_PART * height * (way_point.tolerance == NEAR)
+        spread = HAND_POSITION[way_point.tolerance] + HAND_HEIGHT_PART * height * (
+            way_point.tolerance == NEAR
+        )
         x, y, z = HAND_TURN * self._hand.standard_normal(3)
         turn = psm.rotation(0, x) @ psm.rotation(1, y) @ psm.rotation(2, z)
         offset = spread * self._hand.standard_normal(3)
@@ -177,4 +185,6 @@ class Supervisor(OpenLoop):
 
 def _differs(pose: Pose, way_point: WayPoint) -> bool:
     turn = np.linalg.norm(psm.rotation_vector(pose.rotation.T @ way_point.pose.rotation))
-    return bool(np.linalg.norm(pose.position - way_point.pose.position) > way_point.tolerance or turn > TURN_TOLERANCE)
+    return bool(
+        np.linalg.norm(pose.position - way_point.pose.position) > way_point.tolerance or turn > TURN_TOLERANCE
+    )

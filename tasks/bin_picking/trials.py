@@ -21,7 +21,9 @@ class End(Enum):
     """How a bin ended."""
 
     CLEARED = "cleared"  # all objects are in cups
-    MISSED = "missed"  # four attempts in a row brought not exactly one object into a cup, or too many were made
+    MISSED = (
+        "missed"  # four attempts in a row brought not exactly one object into a cup, or too many were made
+    )
     LOST = "lost"  # an object lies outside of bin and cups
     UNSEEN = "unseen"  # objects are left, and none is seen
     FOAM = "foam"  # the jaws were pressed further into the foam than it gives way
@@ -35,8 +37,8 @@ class Attempt:
     :param before: how many objects were in the bin.
     :param lifted: the objects that the jaws first lifted.
     :param carried: those that they held when they opened.
-    :param places: where the latter then were, or where the gripper was that held none; empty where the jaws did not
-        open before the trial's time was over.
+    :param places: where the latter then were, or where the gripper was that held none; empty where the jaws
+        did not open before the trial's time was over.
     :param steps: how many control steps it took.
     """
 
@@ -64,8 +66,8 @@ class Attempt:
 
 @dataclass
 class Trials:
-    """The attempts in a bin with objects of these kinds, how many control steps the trial at hand has had, and how the
-    bin ended.
+    """The attempts in a bin with objects of these kinds, how many control steps the trial at hand has had,
+    and how the bin ended.
     """
 
     kinds: Sequence[str]
@@ -79,8 +81,8 @@ class Trials:
         self.steps = 0
 
     def missed(self) -> bool:
-        """Whether the last four attempts brought nothing into a cup, or there were four for each object: so a bin ends
-        even where objects come back.
+        """Whether the last four attempts brought nothing into a cup, or there were four for each object: so a
+        bin ends even where objects come back.
         """
         last = self.attempts[-MOST_MISSES:]
         if len(self.attempts) >= most_attempts(len(self.kinds)):
@@ -91,11 +93,11 @@ class Trials:
         """Counts over the bin, and how it ended.
 
         ``success``: it was cleared, and every object into its own cup; ``cleared``: into either. Of attempts:
-        ``single``, ``empty`` and ``several`` by how many objects were first lifted, ``slipped`` where fewer were left
-        when the jaws opened. One that holds one object when the jaws open is to be delivered (``due_cups``, of them
-        ``kept`` not dropped into the bin, ``delivered`` into a cup and ``sorted`` into its own), another one is to be
-        recovered from (``due_recoveries``, of them ``recovered``): opened over the bin. ``nothing`` and
-        ``nothing_recovered`` are those of the latter two that hold nothing.
+        ``single``, ``empty`` and ``several`` by how many objects were first lifted, ``slipped`` where fewer
+        were left when the jaws opened. One that holds one object when the jaws open is to be delivered
+        (``due_cups``, of them ``kept`` not dropped into the bin, ``delivered`` into a cup and ``sorted`` into
+        its own), another one is to be recovered from (``due_recoveries``, of them ``recovered``): opened over
+        the bin. ``nothing`` and ``nothing_recovered`` are those of the latter two that hold nothing.
         """
         attempts = [attempt for attempt in self.attempts if attempt.places]
         loaded = [attempt for attempt in attempts if len(attempt.carried) == 1]

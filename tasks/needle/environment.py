@@ -1,9 +1,9 @@
 """Needle insertion: grasp a suturing needle, turn it towards a tissue phantom, insert it into a 1 cm target.
 
-After the paper's first physical experiment (Physical Experiment 1 and SM 1.3). A da Vinci-like arm with inexact
-encoders has 15 control steps; in each it is given six joint angles and a jaw angle, moves there and settles. It is seen
-through its encoders and through a camera 650 mm above the mat. Simulated lengths are metres; what is observed is in
-millimetres.
+After the paper's first physical experiment (Physical Experiment 1 and SM 1.3). A da Vinci-like arm with
+inexact encoders has 15 control steps; in each it is given six joint angles and a jaw angle, moves there and
+settles. It is seen through its encoders and through a camera 650 mm above the mat. Simulated lengths are
+metres; what is observed is in millimetres.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ JAW_RANGE = (0.0, 0.6)  # rad, between the jaws
 
 START_CENTRE = np.array([-0.018, 0.004])  # m: mean position of the middle of the needle's arc
 START_SPREAD = np.array([0.012, 0.012])  # m: half widths of the uniform distribution about it
-START_TURN = np.deg2rad(30.0)  # half width about the heading that would bring the tip straight into the phantom
+START_TURN = np.deg2rad(
+    30.0
+)  # half width about the heading that would bring the tip straight into the phantom
 
 # What differs from episode to episode besides the needle's pose; standard deviations.
 REPEATABILITY = np.array([6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3])  # rad, m: under 0.2 mm at the gripper
@@ -61,7 +63,9 @@ class NeedleInsertion(base.Task):
         """Set points [7] for what the encoders read: six joints (rad, insertion in m), jaw (rad)."""
         del physics
         limits = np.vstack([psm.JOINT_RANGES, JAW_RANGE])
-        return specs.BoundedArray((7,), float, limits[:, 0], limits[:, 1], name=",".join((*psm.JOINTS, "jaw")))
+        return specs.BoundedArray(
+            (7,), float, limits[:, 0], limits[:, 1], name=",".join((*psm.JOINTS, "jaw"))
+        )
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Send the arm to where the encoders will read ``action`` [7], within the joints' limits."""
@@ -74,9 +78,9 @@ class NeedleInsertion(base.Task):
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
         """What encoders and camera tell.
 
-        ``gripper_pose`` [6]: position (mm) and rotation vector (rad) as the encoders give them, with kinematic error;
-        ``jaw`` [1] (rad); ``needle_ellipse`` [6]: see :func:`ddco_tasks.vision.ellipse`. While too little of the needle
-        is in view its last ellipse stays.
+        ``gripper_pose`` [6]: position (mm) and rotation vector (rad) as the encoders give them, with
+        kinematic error; ``jaw`` [1] (rad); ``needle_ellipse`` [6]: see :func:`ddco_tasks.vision.ellipse`.
+        While too little of the needle is in view its last ellipse stays.
         """
         reported = psm.forward(physics.encoders())
         image = render(physics, "endoscope", vision.IMAGE_SIZE, vision.IMAGE_SIZE)
@@ -84,7 +88,9 @@ class NeedleInsertion(base.Task):
         if seen is not None:
             self._ellipse = seen
         observation = OrderedDict()
-        observation["gripper_pose"] = np.concatenate([reported.position * 1e3, psm.rotation_vector(reported.rotation)])
+        observation["gripper_pose"] = np.concatenate(
+            [reported.position * 1e3, psm.rotation_vector(reported.rotation)]
+        )
         observation["jaw"] = np.array([physics.jaw()])
         observation["needle_ellipse"] = self._ellipse.copy()
         return observation
@@ -110,9 +116,9 @@ class Environment(control.Environment):
 def measures(physics: Physics) -> dict[str, float]:
     """How the episode stands: ``grasped``, ``inserted``, ``success`` (0 or 1) and ``accuracy_mm``.
 
-    ``grasped``: the needle was held at some time; ``inserted``: its tip is 3 mm deep in the phantom, anywhere (NaN
-    where it never was grasped); ``success``: it went in within the 1 cm target region; ``accuracy_mm``: from the centre
-    of the target to where the tip went in (NaN where it is not in).
+    ``grasped``: the needle was held at some time; ``inserted``: its tip is 3 mm deep in the phantom, anywhere
+    (NaN where it never was grasped); ``success``: it went in within the 1 cm target region; ``accuracy_mm``:
+    from the centre of the target to where the tip went in (NaN where it is not in).
     """
     grasped = physics.events.grasped
     inserted = grasped and physics.events.entry is not None and physics.depth() >= INSERTED_DEPTH
@@ -150,5 +156,9 @@ task = Task(
     frame=frame,
     steps=STEPS,
     measures={"grasped": "rate", "inserted": "rate", "success": "rate", "accuracy_mm": "mean"},
-    sources=(HERE / "needle.xml", *sorted(HERE.glob("*.py")), *(HERE.parent / name for name in SHARED_SOURCES)),
+    sources=(
+        HERE / "needle.xml",
+        *sorted(HERE.glob("*.py")),
+        *(HERE.parent / name for name in SHARED_SOURCES),
+    ),
 )

@@ -1,7 +1,7 @@
 """The shape of the needle, and the gripper poses that its grasp and its insertion ask for.
 
-The needle's frame: origin in the middle of the arc, x along the wire towards the tip, the arc bends towards y. Metres
-and radians.
+The needle's frame: origin in the middle of the arc, x along the wire towards the tip, the arc bends towards
+y. Metres and radians.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from ..vision import principal_angle
 ARC_RADIUS = 0.013  # m
 ARC_HALF_ANGLE = np.pi / 4  # a quarter of a circle
 WIRE_RADIUS = 0.0005  # m
-MIDDLE_HEADING = -ARC_HALF_ANGLE  # heading of the middle of the arc when the tip points along +x, into the phantom
+MIDDLE_HEADING = (
+    -ARC_HALF_ANGLE
+)  # heading of the middle of the arc when the tip points along +x, into the phantom
 TIP = ARC_RADIUS * np.array([np.sin(ARC_HALF_ANGLE), 1.0 - np.cos(ARC_HALF_ANGLE), 0.0])
 TIP_DIRECTION = np.array([np.cos(ARC_HALF_ANGLE), np.sin(ARC_HALF_ANGLE), 0.0])
 ELLIPSE_CENTRE = np.array([0.0, 0.00226, 0.0])  # of the hull's ellipse, in the needle's frame
@@ -36,7 +38,8 @@ def arc_tangent(coordinate: float) -> np.ndarray:
 
 
 def lying_needle(features: np.ndarray) -> Pose:
-    """The pose of a needle that lies on the mat, from its ellipse [6] (mm; see :func:`ddco_tasks.vision.ellipse`).
+    """The pose of a needle that lies on the mat, from its ellipse [6] (mm; see
+    :func:`ddco_tasks.vision.ellipse`).
 
     An ellipse looks the same after half a turn: of the two headings, the one nearer to the phantom is taken.
     """

@@ -1,8 +1,9 @@
 """The scene of the needle task: what is measured in it, and what grip and phantom do to the needle.
 
-The jaws really close on the needle, by contact. Contact alone would hold a steel wire between flat pads either rigidly
-or not at all, so once both pads press on it a weld takes over, in a pose that is *deflected* from the one in which the
-needle was caught. The phantom stops a needle that meets it at a flat angle and lets another one in.
+The jaws really close on the needle, by contact. Contact alone would hold a steel wire between flat pads
+either rigidly or not at all, so once both pads press on it a weld takes over, in a pose that is *deflected*
+from the one in which the needle was caught. The phantom stops a needle that meets it at a flat angle and lets
+another one in.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ SETTLE_TIME = 0.16  # s, before observing
 GRIP_FORCE = 0.05  # N on each pad: the least that makes a grasp
 CLOSED = 0.20  # rad: the needle can be held while the jaws are told to be closer than this
 
-# In-hand deflection when the jaws close, about the gripper's axis (turn) and about the pads' normal (tilt). It grows
-# with the distance of the grasp from the middle of the arc and with the angle between pads and wire.
+# In-hand deflection when the jaws close, about the gripper's axis (turn) and about the pads' normal (tilt).
+# It grows with the distance of the grasp from the middle of the arc and with the angle between pads and wire.
 TURN_PER_OFFSET = 35.0  # rad per m
 TURN_PER_ANGLE = 0.8
 TILT_PER_OFFSET = 10.0  # rad per m
@@ -132,7 +133,9 @@ class Physics(ArmPhysics):
         closing = 2 * self._to[7] < CLOSED and np.array_equal(self.control(), self._to)
         if closing and not self.held() and np.all(self.pad_forces() > GRIP_FORCE):
             deflected = self._deflected(self.grip())
-            wrist = psm.Pose(np.eye(3), np.array([0.0, 0.0, -psm.JAW_LENGTH]))  # the pads, from the gripper's body
+            wrist = psm.Pose(
+                np.eye(3), np.array([0.0, 0.0, -psm.JAW_LENGTH])
+            )  # the pads, from the gripper's body
             self._weld("grip", wrist @ deflected)
             self.named.model.geom_conaffinity[list(PADS)] = 0
             self._to[6:] = self.jaw() / 2  # the servos stall on the needle

@@ -1,8 +1,8 @@
 """Scripted policies of the needle task: the open-loop plan, and the supervisor that corrects it.
 
-The paper's demonstrations came from an open-loop policy of 15 joint-angle way points which a person interrupted when it
-was about to fail; the adjustment was recorded as a change of the joint angles and carried through the rest of the
-trajectory. Here the person is replaced by a corrector that sees the true state.
+The paper's demonstrations came from an open-loop policy of 15 joint-angle way points which a person
+interrupted when it was about to fail; the adjustment was recorded as a change of the joint angles and carried
+through the rest of the trajectory. Here the person is replaced by a corrector that sees the true state.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from .physics import Physics
 
 JAW_OPEN = 0.42  # rad: leaves 1.6 mm on either side of the wire
 JAW_CLOSED = 0.0
-# At home the gripper is beside the part of the mat where needles lie, so that the camera sees all of the needle.
+# At home the gripper is beside the part of the mat where needles lie, so that the camera sees all of the
+# needle.
 HOME = psm.inverse(Pose(psm.rotation(2, np.pi / 4), np.array([-0.015, -0.036, 0.040])))
 
-# The 15 way points. Heights are above the needle, standoffs from the phantom's face to the tip (negative: outside).
+# The 15 way points. Heights are above the needle, standoffs from the phantom's face to the tip (negative:
+# outside).
 APPROACH_FRACTION = 0.6  # way point 0: this far along the path from home to way point 1
 APPROACH_HEIGHTS = (0.015, 0.006, 0.0, 0.0)  # m, way points 1 to 4; the jaws close in the last
 LIFT_HEIGHTS = (0.010, 0.022)  # m, way points 5 and 6
@@ -48,7 +50,17 @@ HAND_POSITION = 0.0004  # m, in each direction
 HAND_TURN = np.deg2rad(1.5)
 HAND_POSITION_AWAY = 0.12  # more, in m per m that remains to needle or phantom
 HAND_TURN_AWAY = 4.0  # rad per m
-REMAINING = {1: 0.015, 2: 0.006, 3: 0.0, 8: 0.018, 9: 0.012, 10: 0.010, 11: 0.007, 12: 0.004, 13: 0.0}  # m, by step
+REMAINING = {
+    1: 0.015,
+    2: 0.006,
+    3: 0.0,
+    8: 0.018,
+    9: 0.012,
+    10: 0.010,
+    11: 0.007,
+    12: 0.004,
+    13: 0.0,
+}  # m, by step
 
 CLEARANCE = 0.001  # m, that planned paths keep from mat and phantom
 # The target and the phantom's extent, as the planner knows them (m).
@@ -70,7 +82,9 @@ def make_plan(observation: Observation) -> Plan:
     insertion = geometry.insertion_pose(geometry.NOMINAL_GRIP, TARGET)
     above = [psm.inverse(raised(grasp, height)) for height in APPROACH_HEIGHTS + LIFT_HEIGHTS]
     into = [psm.inverse(shifted(insertion, np.array([standoff, 0.0, 0.0]))) for standoff in STANDOFFS]
-    approach = points_along(plan_path(HOME, above[0], psm.JOINT_RANGES, is_free), np.array([APPROACH_FRACTION]))
+    approach = points_along(
+        plan_path(HOME, above[0], psm.JOINT_RANGES, is_free), np.array([APPROACH_FRACTION])
+    )
     transfer = points_along(
         plan_path(above[-1], into[0], psm.JOINT_RANGES, is_free_with_needle), np.array(TRANSFER_FRACTIONS)
     )
@@ -116,7 +130,9 @@ def _instrument_points() -> np.ndarray:
 def _needle_points() -> np.ndarray:
     """Points [N, 3] of the needle in the nominal grip, in the gripper's frame."""
     angles = np.linspace(-geometry.ARC_HALF_ANGLE, geometry.ARC_HALF_ANGLE, 9)
-    arc = geometry.ARC_RADIUS * np.stack([np.sin(angles), 1.0 - np.cos(angles), np.zeros_like(angles)], axis=1)
+    arc = geometry.ARC_RADIUS * np.stack(
+        [np.sin(angles), 1.0 - np.cos(angles), np.zeros_like(angles)], axis=1
+    )
     return geometry.NOMINAL_GRIP.apply(arc)
 
 
@@ -153,13 +169,14 @@ class OpenLoop:
 class Supervisor(OpenLoop):
     """The open-loop plan with corrections that are carried through the rest of the trajectory.
 
-    Before a step of the approach or of the insertion it predicts where the next way point would really bring the
-    gripper, and compares with where the plan meant it to be relative to the true needle. If they differ by more than a
-    small tolerance it changes the joint angles by what removes the difference. The jaws are not corrected.
+    Before a step of the approach or of the insertion it predicts where the next way point would really bring
+    the gripper, and compares with where the plan meant it to be relative to the true needle. If they differ
+    by more than a small tolerance it changes the joint angles by what removes the difference. The jaws are
+    not corrected.
 
-    As with a person, what it does is coarser than what it means to do, far away more so than near the aim. ``intended``
-    is the control it meant, and is what is recorded: demonstrations show how to come back from an inexact move without
-    teaching the inexactness (noise while executing with clean labels).
+    As with a person, what it does is coarser than what it means to do, far away more so than near the aim.
+    ``intended`` is the control it meant, and is what is recorded: demonstrations show how to come back from
+    an inexact move without teaching the inexactness (noise while executing with clean labels).
     """
 
     def __init__(self, environment: dm_env.Environment) -> None:

@@ -1,8 +1,9 @@
 """Pushing whose goal is shown once: the box comes long after the goal has gone out of sight.
 
-For a quarter of a second the goal is seen, on the left or on the right, while the arm goes home, above the middle. Two
-to three seconds later a box comes to the middle, and has to be pushed over the line on the goal's side. Until then arm
-and box move alike whichever side it is: what is seen after the cue does not tell the goal.
+For a quarter of a second the goal is seen, on the left or on the right, while the arm goes home, above the
+middle. Two to three seconds later a box comes to the middle, and has to be pushed over the line on the goal's
+side. Until then arm and box move alike whichever side it is: what is seen after the cue does not tell the
+goal.
 """
 
 from __future__ import annotations
@@ -111,8 +112,8 @@ class Patient(Supervisor):
 
 
 def outcome(ended: dm_env.Environment) -> dict[str, float]:
-    """What became of the box: over the line on the goal's side (``success``) or on the other (``wrong_side``),
-    ``toppled``, or ``missed``: none of them in time.
+    """What became of the box: over the line on the goal's side (``success``) or on the other
+    (``wrong_side``), ``toppled``, or ``missed``: none of them in time.
     """
     counts: environment.Counts = ended.task.counts
     return {

@@ -1,9 +1,10 @@
-"""Planar pushing: a 3-link arm pushes a box along a surface to goals on its left and right without toppling it.
+"""Planar pushing: a 3-link arm pushes a box along a surface to goals on its left and right without toppling
+it.
 
-After the paper's simulation (§5.1, SM 1.1), in MuJoCo instead of Box2D: links of 5, 5 and 3 units (0.1 m each) in the
-vertical plane, controlled by joint velocities; a box with friction and gravity; as many goals as possible in 2000 steps
-of 50 ms. The box is 0.16 m wide and 0.25 m high; a push higher than half its width over the friction coefficient,
-0.2 m, topples it.
+After the paper's simulation (§5.1, SM 1.1), in MuJoCo instead of Box2D: links of 5, 5 and 3 units (0.1 m
+each) in the vertical plane, controlled by joint velocities; a box with friction and gravity; as many goals as
+possible in 2000 steps of 50 ms. The box is 0.16 m wide and 0.25 m high; a push higher than half its width
+over the friction coefficient, 0.2 m, topples it.
 """
 
 from __future__ import annotations
@@ -64,10 +65,13 @@ class Pushing(base.Task):
     """Starts, observes and rewards an episode.
 
     :param goal_steps: steps after which a goal is missed, and box and goal are drawn anew; None for no limit.
-    :param single: the episode is about one goal: it ends when that is reached or missed, or the box has to be put back.
+    :param single: the episode is about one goal: it ends when that is reached or missed, or the box has to be
+        put back.
     """
 
-    def __init__(self, goal_steps: int | None = None, single: bool = False, random: int | None = None) -> None:
+    def __init__(
+        self, goal_steps: int | None = None, single: bool = False, random: int | None = None
+    ) -> None:
         super().__init__(random=random)
         self._goal_steps, self._single = goal_steps, single
         self.counts = Counts()
@@ -90,7 +94,9 @@ class Pushing(base.Task):
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Joint velocities [3] (rad/s); the servos saturate at the limits."""
         del physics
-        return specs.BoundedArray((3,), float, -geometry.MAX_SPEED, geometry.MAX_SPEED, name="shoulder,elbow,wrist")
+        return specs.BoundedArray(
+            (3,), float, -geometry.MAX_SPEED, geometry.MAX_SPEED, name="shoulder,elbow,wrist"
+        )
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Send the joint velocities to the servos, which saturate at their limits."""
@@ -128,8 +134,8 @@ class Pushing(base.Task):
         """The state, in the paper's coordinates and relative to tip and box.
 
         ``joint_angles`` [3] (rad), ``joint_velocities`` [3] (rad/s), ``box_pose`` [3]: x, z (m), tilt (rad),
-        ``goal`` [1]: x (m); ``tip`` [2]: x, z (m); ``box_from_tip`` [2]: from the tip to the box's centre (m);
-        ``goal_from_box`` [1] and ``goal_from_tip`` [1]: along x (m).
+        ``goal`` [1]: x (m); ``tip`` [2]: x, z (m); ``box_from_tip`` [2]: from the tip to the box's centre
+        (m); ``goal_from_box`` [1] and ``goal_from_tip`` [1]: along x (m).
         """
         box, tip, goal = physics.box(), physics.tip(), physics.goal()
         observation = OrderedDict()
@@ -213,8 +219,8 @@ class Environment(control.Environment):
 
 
 def outcome(environment: dm_env.Environment) -> dict[str, float]:
-    """The counts of the episode: ``goals`` reached, ``topples``, boxes pushed out of reach (``lost``), goals ``missed``
-    (NaN without a limit), and ``success``: at least one goal was reached.
+    """The counts of the episode: ``goals`` reached, ``topples``, boxes pushed out of reach (``lost``), goals
+    ``missed`` (NaN without a limit), and ``success``: at least one goal was reached.
     """
     counts: Counts = environment.task.counts
     return {
@@ -255,11 +261,21 @@ def _load(task: Pushing) -> Environment:
     return Environment(Physics.from_xml_path(str(HERE / "pushing.xml")), task, n_sub_steps=SUB_STEPS)
 
 
-MEASURES: dict[str, Kind] = {"success": "rate", "goals": "mean", "topples": "mean", "lost": "mean", "missed": "mean"}
+MEASURES: dict[str, Kind] = {
+    "success": "rate",
+    "goals": "mean",
+    "topples": "mean",
+    "lost": "mean",
+    "missed": "mean",
+}
 
 
 def _task(name: str, load: Callable[[int], Environment], steps: int) -> Task:
-    sources = (HERE / "pushing.xml", *sorted(HERE.glob("*.py")), *(HERE.parent / name for name in SHARED_SOURCES))
+    sources = (
+        HERE / "pushing.xml",
+        *sorted(HERE.glob("*.py")),
+        *(HERE.parent / name for name in SHARED_SOURCES),
+    )
     cameras = {"camera": camera(*CAMERA_SIZE)}
     return Task(name, load, supervisor.POLICIES, outcome, frame, sources, steps, MEASURES, cameras)
 

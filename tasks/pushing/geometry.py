@@ -1,7 +1,7 @@
 """Geometry of the pushing task in its plane (x, z): the arm's kinematics, and what is clear of the box.
 
-Angles are those of the model: all 0 is an arm that hangs straight down, positive ones turn what hangs towards +x. The
-*pitch* of the hand is the sum of the three.
+Angles are those of the model: all 0 is an arm that hangs straight down, positive ones turn what hangs towards
++x. The *pitch* of the hand is the sum of the three.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def tip_position(angles: np.ndarray) -> np.ndarray:
 def inverse(tip: np.ndarray, pitch: float) -> np.ndarray:
     """Joint angles [3] that bring the tip to (x, z) with the hand at ``pitch``.
 
-    Where that is out of reach, those of the nearest wrist position within it: the hand keeps its pitch, and the tip
-    comes as near along the line from the shoulder as it can.
+    Where that is out of reach, those of the nearest wrist position within it: the hand keeps its pitch, and
+    the tip comes as near along the line from the shoulder as it can.
     """
     wrist_x = float(tip[0]) - LINKS[2] * math.sin(pitch)
     wrist_down = BASE_HEIGHT - (float(tip[1]) + LINKS[2] * math.cos(pitch))
@@ -68,7 +68,9 @@ def is_clear(angles: np.ndarray, box_x: float, margin: float) -> bool:
     if min(z for _, z in points[1:]) < RADIUS:
         return False
     half, top = CONTACT + margin, BOX_HEIGHT + RADIUS + margin
-    return not any(_meets((a[0] - box_x, a[1]), (b[0] - box_x, b[1]), half, top) for a, b in itertools.pairwise(points))
+    return not any(
+        _meets((a[0] - box_x, a[1]), (b[0] - box_x, b[1]), half, top) for a, b in itertools.pairwise(points)
+    )
 
 
 def _meets(a: Point, b: Point, half: float, top: float) -> bool:

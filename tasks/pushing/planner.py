@@ -1,9 +1,10 @@
-"""The planning supervisor's mind: RRT-Connect round the box to a place behind it, then along a band of tip heights.
+"""The planning supervisor's mind: RRT-Connect round the box to a place behind it, then along a band of tip
+heights.
 
-After the paper's supervisor (§5.1, SM 1.1), whose one parameter is the longest branch of the tree, 0.1. A plan is made
-a function of the state, so that it can be imitated: the planner starts from the same random numbers for every plan,
-paths are cut short until little of their random growth is left, the configurations they lead to follow a rule, and all
-pushes to a side go along one path, wherever they begin.
+After the paper's supervisor (§5.1, SM 1.1), whose one parameter is the longest branch of the tree, 0.1. A
+plan is made a function of the state, so that it can be imitated: the planner starts from the same random
+numbers for every plan, paths are cut short until little of their random growth is left, the configurations
+they lead to follow a rule, and all pushes to a side go along one path, wherever they begin.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ LEVEL, UPRIGHT = (
     0.1,
 )  # m, rad: the same for a path along which all pushes go: a low one kicks the box's foot away
 FARTHEST = 0.55  # m: where such a path begins and ends
-ROOM = np.array([0.3, 0.3, 0.4])  # rad: how far a push may leave the range of its ends, which keeps the tree small
+ROOM = np.array(
+    [0.3, 0.3, 0.4]
+)  # rad: how far a push may leave the range of its ends, which keeps the tree small
 
 SPACING = 0.02  # rad, between the points of a path
 LOOK_AHEAD = 0.35  # rad along the path: where the arm aims
@@ -53,9 +56,9 @@ class Plan(NamedTuple):
 class Planner:
     """Follows plans; makes another when the one it has is no longer valid, or at every step.
 
-    :param repeatable: whether equal scenes give equal plans, and equal goals equal pushes. If not, the random numbers
-        go on, paths are only cut short by leaving out corners, and the configurations that they lead to are drawn: what
-        the planner does by itself.
+    :param repeatable: whether equal scenes give equal plans, and equal goals equal pushes. If not, the random
+        numbers go on, paths are only cut short by leaving out corners, and the configurations that they lead
+        to are drawn: what the planner does by itself.
     """
 
     replanning: Replanning = "when_invalid"
@@ -131,7 +134,9 @@ def push_path(side: int) -> np.ndarray:
 def planned_push(start: np.ndarray, goal: np.ndarray, is_free: IsFree, settings: Settings) -> np.ndarray:
     """A path [N, 3] between joint angles that leaves the range of its ends by a little ``ROOM`` only."""
     ends = np.array([start, goal])
-    ranges = np.stack([within_limits(ends.min(axis=0) - ROOM), within_limits(ends.max(axis=0) + ROOM)], axis=1)
+    ranges = np.stack(
+        [within_limits(ends.min(axis=0) - ROOM), within_limits(ends.max(axis=0) + ROOM)], axis=1
+    )
     return dense(plan_path(start, goal, ranges, is_free, settings))
 
 
@@ -159,8 +164,8 @@ def may_push(angles: np.ndarray, scene: Scene) -> bool:
 
 
 def is_valid(plan: Plan, scene: Scene) -> bool:
-    """Whether a plan made for another scene still serves: same goal and side, box and arm where they were expected, and
-    the arm in place to push where the plan is to push, and nowhere else.
+    """Whether a plan made for another scene still serves: same goal and side, box and arm where they were
+    expected, and the arm in place to push where the plan is to push, and nowhere else.
     """
     if scene.goal != plan.scene.goal or scene.side != plan.scene.side:
         return False

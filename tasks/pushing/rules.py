@@ -1,7 +1,7 @@
 """How to push, as both supervisors know it: what is behind the box, how high to push, how fast to move.
 
-Everything is written for a box that has to go right; ``side`` (-1 or 1) mirrors it for a box that has to go left. The
-elbow always bends the same way, so the two are different motions of the arm: forehand and backhand.
+Everything is written for a box that has to go right; ``side`` (-1 or 1) mirrors it for a box that has to go
+left. The elbow always bends the same way, so the two are different motions of the arm: forehand and backhand.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from .geometry import CONTACT, MAX_SPEED
 PUSH_HEIGHT = 0.10  # m: a push above half width / friction = 0.2 m would topple the box
 PUSH_PITCH = 0.3  # rad: the hand leans so that the tip leads
 BEHIND = CONTACT + 0.08  # m: from the box's centre to where the tip comes down
-# The box is pushed to its goal without coming to a halt before it. Once it passes, the goal is on the other side: the
-# tip turns back, and friction stops the box at once.
+# The box is pushed to its goal without coming to a halt before it. Once it passes, the goal is on the other
+# side: the tip turns back, and friction stops the box at once.
 FOLLOW_THROUGH = 0.02  # m: how far ahead of itself the tip aims when the box is at its goal
 SLOW_DOWN = 0.6  # more, per m that remains
 FULL_ADVANCE = 0.1  # m: at most
@@ -42,7 +42,9 @@ class Scene(NamedTuple):
 def scene(observation: Observation) -> Scene:
     """The scene of an observation."""
     return Scene(
-        np.array(observation["joint_angles"], float), float(observation["box_pose"][0]), float(observation["goal"][0])
+        np.array(observation["joint_angles"], float),
+        float(observation["box_pose"][0]),
+        float(observation["goal"][0]),
     )
 
 

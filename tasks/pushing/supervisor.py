@@ -1,7 +1,8 @@
-"""Scripted policies of the pushing task: way points by rule, and plans by RRT-Connect. Both see what a learner can see.
+"""Scripted policies of the pushing task: way points by rule, and plans by RRT-Connect. Both see what a
+learner can see.
 
-Any of them can be recorded with a disturbed hand: its moves are inexact while its intentions are recorded, so that
-demonstrations show how to come back from an inexact move without teaching the inexactness.
+Any of them can be recorded with a disturbed hand: its moves are inexact while its intentions are recorded, so
+that demonstrations show how to come back from an inexact move without teaching the inexactness.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from .rules import Scene
 
 HAND = 0.2  # rad/s: standard deviation of what a disturbed hand adds to the velocity of each joint
 SHAKIER = (0.3, 0.4)  # rad/s: more of that, for demonstrations that show more ways back
-HAND_MEMORY = 0.8  # of that, from one step to the next: white noise of the same reach would kick the box about
+HAND_MEMORY = (
+    0.8  # of that, from one step to the next: white noise of the same reach would kick the box about
+)
 
 STEP = rules.FULL_ADVANCE  # how far ahead of itself the tip aims
 OVER = geometry.BOX_HEIGHT + geometry.RADIUS + 0.13  # m: tip height to cross the box
@@ -80,7 +83,8 @@ def way_point(tip: np.ndarray, scene: Scene) -> np.ndarray:
         return np.array([tip[0] + side * rules.advance(scene), rules.PUSH_HEIGHT])
     if along < -geometry.BOX_HALF_WIDTH and (tip[1] < BESIDE or along < COLUMN - rules.BEHIND):
         return np.array([column, rules.PUSH_HEIGHT])
-    # Up first, then across: gradually, because a switch between the two would make the tip dither at its threshold.
+    # Up first, then across: gradually, because a switch between the two would make the tip dither at its
+    # threshold.
     beside = scene.box + side * (max(along, rules.BEHIND) if tip[1] < BESIDE else along)
     across = float(np.clip((tip[1] - CROSS_FROM) / (OVER - LAG - CROSS_FROM), 0.0, 1.0))
     return np.array([beside + across * (column - beside), OVER])

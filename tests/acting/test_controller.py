@@ -95,7 +95,9 @@ def test_marginal_adds_up_over_steps_how_likely_it_is_that_an_option_has_ended()
     controllers = [Controller(hierarchy, options=options) for options in ("most_likely", "marginal")]
     played = [play(controller, 1)[0] for controller in controllers]
     fix(hierarchy.meta_policy.network, [[50.0, 0.0, 0.0]])
-    assert [first + play(controller, 3)[0] for first, controller in zip(played, controllers, strict=True)] == [
+    assert [
+        first + play(controller, 3)[0] for first, controller in zip(played, controllers, strict=True)
+    ] == [
         [2, 2, 2, 2],
         [2, 2, 1, 1],  # 0.7, then 0.49
     ]
@@ -103,7 +105,11 @@ def test_marginal_adds_up_over_steps_how_likely_it_is_that_an_option_has_ended()
 
 @pytest.mark.parametrize(
     ("counts", "emits", "network"),
-    [((2,), ("options",), "linear"), ((2, 2), ("options", "control"), "linear"), ((2,), ("options",), "lstm")],
+    [
+        ((2,), ("options",), "linear"),
+        ((2, 2), ("options", "control"), "linear"),
+        ((2,), ("options",), "lstm"),
+    ],
 )
 def test_choices_follow_the_models_latents(counts, emits, network):
     """Over many episodes of three different states, p(h_t) is that of the AHMM without any control seen."""

@@ -1,8 +1,9 @@
-"""Where the next skill is hidden from what is seen, options that last succeed and a memoryless mixture does not.
+"""Where the next skill is hidden from what is seen, options that last succeed and a memoryless mixture does
+not.
 
-The supervisor moves one way or the other on a line, 1 or -1: this is its *intention*, which the observation ``seen``
-does not tell. In the control case the observation ``intention`` tells it, and the two are equal. Clusters are of
-observations and controls, since those of observations cannot tell apart what looks alike.
+The supervisor moves one way or the other on a line, 1 or -1: this is its *intention*, which the observation
+``seen`` does not tell. In the control case the observation ``intention`` tells it, and the two are equal.
+Clusters are of observations and controls, since those of observations cannot tell apart what looks alike.
 Seeds are those that the library counts from by default; none is chosen for what it gives.
 """
 
@@ -67,8 +68,8 @@ class ThereAndBack(dm_env.Environment):
 class Supervisor:
     """Moves as it intends to, with a hand that shakes.
 
-    :param forgetful: it draws its intention anew at every step, about as often as the supervisor has it where it sees
-        what is seen. It knows both moves exactly, and lacks memory alone.
+    :param forgetful: it draws its intention anew at every step, about as often as the supervisor has it where
+        it sees what is seen. It knows both moves exactly, and lacks memory alone.
     """
 
     def __init__(self, environment: ThereAndBack, forgetful: bool = False) -> None:

@@ -22,7 +22,8 @@ WINDOWS = {"network": "lstm", "horizon": 4}
     [((3,), "mlp"), ((2, 2), "mlp"), ((2, 2), "lstm"), pytest.param((2, 2), WINDOWS, id="windows")],
 )
 def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network):
-    """Before the last control is known, the belief is the posterior of the demonstration without that control.
+    """Before the last control is known, the belief is the posterior of the demonstration without that
+    control.
 
     An episode that was broken off before is forgotten.
     """
@@ -70,11 +71,15 @@ def test_a_recogniser_of_the_past_is_evidence_at_every_step(watched):
     demo, past = demos[0], hierarchy.recogniser.past
     found, value = beliefs(hierarchy, demo)
     for t, levels in enumerate(found):
-        batch = encode(Demonstrations([demo]), hierarchy.encoder, hierarchy.scaling).select(torch.tensor([0]), t + 1)
+        batch = encode(Demonstrations([demo]), hierarchy.encoder, hierarchy.scaling).select(
+            torch.tensor([0]), t + 1
+        )
         actions = torch.cat([torch.zeros(1, 1, 2), batch.actions[:, :t]], dim=1)
         x = torch.cat([batch.inputs.vector, actions], dim=-1)[0].double()
         rows = [torch.cat([x[s], *(x[max(s - w, 0) : s + 1].mean(0) for w in (1, 2))]) for s in range(t + 1)]
-        ratio = (torch.stack(rows) @ past.weight + past.bias).log_softmax(-1).clamp(min=-12) - past.share.log()
+        ratio = (torch.stack(rows) @ past.weight + past.bias).log_softmax(-1).clamp(
+            min=-12
+        ) - past.share.log()
         evidence = torch.cat([torch.zeros(t + 1, 1), 0.8 * ratio], dim=1)[None]
         with torch.no_grad():
             tables = hierarchy.tabulate(batch).with_evidence(2, evidence)

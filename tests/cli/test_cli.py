@@ -44,7 +44,7 @@ def run(spec, tmp_path_factory):
     return folder, call("fit", spec, "--out", folder, *short)
 
 
-# --- what works -------------------------------------------------------------------------------------------------------
+# --- what works ---------------------------------------------------------------------------------------------
 
 
 def test_check_shows_defaults_shapes_and_parameters(spec):
@@ -93,7 +93,11 @@ def test_rollout_and_its_report(run):
         assert re.search(rf"^ *{method(name)} +│ +{successes} of 1 \(", ended.out, re.MULTILINE)
     assert len(list((folder / "videos").glob("*.mp4"))) == 4
     again = call("rollout", folder, "--episodes", 1, "--video", "--jobs", 1, "--resume")
-    assert (again.status, again.out, again.err) == (0, ended.out, "")  # nothing is rolled out, so no progress is shown
+    assert (again.status, again.out, again.err) == (
+        0,
+        ended.out,
+        "",
+    )  # nothing is rolled out, so no progress is shown
     assert "open_loop" in (folder / "report.html").read_text()
 
 
@@ -120,7 +124,13 @@ for example in EXAMPLES.values():
 def test_help_cuts_no_option_however_narrow_it_is(columns):
     own = {**os.environ, "COLUMNS": str(columns)}
     ended = subprocess.run([sys.executable, "-c", EVERY_HELP], capture_output=True, text=True, env=own)
-    names = {name for command in COMMANDS.values() for one in command.params for name in one.opts if name[:2] == "--"}
+    names = {
+        name
+        for command in COMMANDS.values()
+        for one in command.params
+        for name in one.opts
+        if name[:2] == "--"
+    }
     assert {name for name in names if name not in ended.stdout} == set()
     assert "\\[" not in ended.stdout
 
@@ -142,7 +152,7 @@ def test_nothing_at_all_is_help():
     assert [command for command in COMMANDS if f" {command} " not in ended.out] == []
 
 
-# --- what does not ----------------------------------------------------------------------------------------------------
+# --- what does not ------------------------------------------------------------------------------------------
 
 
 GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
@@ -151,21 +161,42 @@ GRID = with_set("selection.grid.hierarchy.levels.0.count=[1, 2]")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["check", "nowhere.yaml"], "nowhere.yaml: cannot be read: No such file or directory; check the path"),
+        (
+            ["check", "nowhere.yaml"],
+            "nowhere.yaml: cannot be read: No such file or directory; check the path",
+        ),
         (["check"], "name a spec, such as: ddco-pyro check specs/needle.yaml"),
         (["check", "SPEC", *with_set("training.epochs=many")], "training.epochs: must be a whole number"),
         (["check", "SPEC", *with_set("task=toi")], "no task is registered as 'toi'"),
-        (["check", "SPEC", *with_set("observations=[pose]")], r"observations: there is no pose \(there are: offsets, "),
+        (
+            ["check", "SPEC", *with_set("observations=[pose]")],
+            r"observations: there is no pose \(there are: offsets, ",
+        ),
         (["check", "--foo"], "No such option: --foo; see ddco-pyro check --help"),
         (["fit"], "Missing argument 'SPEC'; see ddco-pyro fit --help"),
         (["chekc"], "No such command 'chekc'.*; see ddco-pyro --help"),
-        (["rollout", "RUN", "--episodes", "0"], "Invalid value for '--episodes': .*; see ddco-pyro rollout --help"),
-        (["collect", "SPEC", *with_set("task=null", "demonstrations.path=x")], r"toy\.yaml: names no task, so there"),
+        (
+            ["rollout", "RUN", "--episodes", "0"],
+            "Invalid value for '--episodes': .*; see ddco-pyro rollout --help",
+        ),
+        (
+            ["collect", "SPEC", *with_set("task=null", "demonstrations.path=x")],
+            r"toy\.yaml: names no task, so there",
+        ),
         (["fit", "SPEC", "--out", "RUN"], "holds a run of another spec; choose another --out or remove it"),
-        (["fit", "RUN/spec.yaml", "--out", "RUN"], "holds a run of this spec already; show it with --resume, or"),
+        (
+            ["fit", "RUN/spec.yaml", "--out", "RUN"],
+            "holds a run of this spec already; show it with --resume, or",
+        ),
         (["select", "SPEC"], "selection.grid: is empty; name what to try, such as selection.grid: {.*}"),
-        (["select", "SPEC", *GRID, "--jobs", "0"], "--jobs 0: give a number of processes, or -1 for one on each core"),
-        (["compare", "RUN"], "one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat"),
+        (
+            ["select", "SPEC", *GRID, "--jobs", "0"],
+            "--jobs 0: give a number of processes, or -1 for one on each core",
+        ),
+        (
+            ["compare", "RUN"],
+            "one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -198,13 +229,18 @@ def test_training_that_fails_says_why(spec, tmp_path):
     ended = call("fit", spec, "--out", tmp_path / "run", *diverging)
     assert ended.status == 1
     *_, last = ended.err.splitlines()
-    assert re.match(r"ddco-pyro: stage vq-1, epoch \d+: the log-likelihood of demo_\d+.* is not finite; look at", last)
+    assert re.match(
+        r"ddco-pyro: stage vq-1, epoch \d+: the log-likelihood of demo_\d+.* is not finite; look at", last
+    )
 
 
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (ZeroDivisionError("two\nlines"), "unexpected ZeroDivisionError: two lines; --debug shows where it comes from"),
+        (
+            ZeroDivisionError("two\nlines"),
+            "unexpected ZeroDivisionError: two lines; --debug shows where it comes from",
+        ),
         (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
         (KeyboardInterrupt(), "interrupted"),
     ],
@@ -229,7 +265,7 @@ def test_debug_shows_the_traceback():
         assert ended.err.splitlines()[-1].startswith("ddco_pyro.spec.SpecError: nowhere.yaml: cannot be read")
 
 
-# --- in a process of its own ------------------------------------------------------------------------------------------
+# --- in a process of its own --------------------------------------------------------------------------------
 
 
 def test_a_pipe_that_is_closed_ends_it_quietly():
@@ -267,7 +303,9 @@ HEAVY = ("h5py", "matplotlib", "pandas", "pyro", "scipy.stats", "sklearn", "symp
 
 def test_help_and_refusals_load_nothing_heavy():
     """Loading torch, pyro and scikit-learn takes seconds."""
-    program = LIGHT.format(lines=[["fit", "--help"], ["check", "--schema"], ["check", "nowhere.yaml"]], heavy=HEAVY)
+    program = LIGHT.format(
+        lines=[["fit", "--help"], ["check", "--schema"], ["check", "nowhere.yaml"]], heavy=HEAVY
+    )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert [line for line in ended.stdout.splitlines() if line[2:] == "[]"] == ["0 []", "0 []", "2 []"]
 
@@ -286,7 +324,7 @@ def test_check_finds_tasks_beside_it_and_loads_no_package_that_it_does_not_use(s
     assert set(ast.literal_eval(ended.stdout.splitlines()[-1].removeprefix("0 "))) <= {"h5py", "torch"}
 
 
-# --- progress where there is no terminal ------------------------------------------------------------------------------
+# --- progress where there is no terminal --------------------------------------------------------------------
 
 
 @pytest.fixture

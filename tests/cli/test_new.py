@@ -44,7 +44,8 @@ def test_one_command_makes_what_four_make(file: Path, tmp_path: Path) -> None:
     one, four = (ddco_pyro.load(tmp_path / name / "run") for name in ("one", "four"))
     assert one.metrics.model_dump(exclude={"seconds"}) == four.metrics.model_dump(exclude={"seconds"})
     pages = [
-        (tmp_path / name / "segments.html").read_text().replace(str(tmp_path / name), "") for name in ("one", "four")
+        (tmp_path / name / "segments.html").read_text().replace(str(tmp_path / name), "")
+        for name in ("one", "four")
     ]
     assert pages[0] == pages[1]
     before = (tmp_path / "one" / "run" / "model.safetensors").stat().st_mtime_ns
@@ -79,7 +80,9 @@ def test_a_folder_of_another_file_is_refused(file: Path, tmp_path: Path) -> None
     quick(tmp_path / "out", file)
     other = tmp_path / "other.hdf5"
     pick_and_place(4).write(other)
-    ended = refused(f"spec.yaml: is for {file}; choose another --out", "new", other, "--out", tmp_path / "out")
+    ended = refused(
+        f"spec.yaml: is for {file}; choose another --out", "new", other, "--out", tmp_path / "out"
+    )
     ended = call("new", tmp_path / "none.hdf5", "--out", tmp_path / "new")
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert not (tmp_path / "new").exists()

@@ -35,7 +35,9 @@ for command in commands:
 def call(folder, *commands):
     """How commands end, one after another in a process that cannot import a simulator: a line each of stderr."""
     command = [sys.executable, "-c", WITHOUT, json.dumps(commands)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=1000).stderr.splitlines()
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=1000
+    ).stderr.splitlines()
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +65,9 @@ def said(folder):
 
 
 def test_from_a_file_to_an_export(folder, said):
-    assert [line for line in said if line.startswith("status ")] == [*["status 0"] * 4, *["status 2"] * 2], said
+    assert [line for line in said if line.startswith("status ")] == [*["status 0"] * 4, *["status 2"] * 2], (
+        said
+    )
     assert (folder / "segments.html").exists()
     assert (folder / "run" / "report.html").exists()
     assert (folder / "controller" / "weights.npz").exists()

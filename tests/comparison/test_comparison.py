@@ -50,7 +50,11 @@ def other(toy_spec, cache, tmp_path_factory):
 def folders(toy_run, other):
     """The toy run, both its baselines, and a run with three options."""
     three = other(hierarchy__levels__0__count=3)
-    return [toy_run.folder, *(toy_run.folder / "baselines" / kind for kind in ("flat", "per_timestep")), three.folder]
+    return [
+        toy_run.folder,
+        *(toy_run.folder / "baselines" / kind for kind in ("flat", "per_timestep")),
+        three.folder,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +70,8 @@ def jackknifed(values, steps):
 
 
 def test_rows_are_what_az_compare_would_say(found, folders, held_out):
-    """rank, elpd, se, elpd_diff and dse of arviz, with a trajectory's log-likelihood for the elpd of an observation;
-    errors are those per step, which for trajectories of one length is the same."""
+    """rank, elpd, se, elpd_diff and dse of arviz, with a trajectory's log-likelihood for the elpd of an
+    observation; errors are those per step, which for trajectories of one length is the same."""
     values = {str(folder): load(folder).log_likelihood(held_out) for folder in folders}
     order = sorted(values, key=lambda name: -values[name].sum())
     assert [(row.rank, row.name) for row in found.rows] == list(enumerate(order))
@@ -103,16 +107,35 @@ def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
 
 def row(name, rank, each, model="ddco", in_training=1.0):
     mean = sum(each) / len(each)
-    return Row(rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, mean, in_training, tuple(each), made_metrics().training)
+    return Row(
+        rank,
+        name,
+        model,
+        3,
+        sum(each),
+        0.1,
+        0.0,
+        0.0,
+        mean,
+        in_training,
+        tuple(each),
+        made_metrics().training,
+    )
 
 
 def test_a_run_that_fell_apart_comes_first_in_the_verdict():
     """By the density without observations; nothing is concluded from its lead over a mixture that fell apart, too."""
-    runs = [("a", "flat", [4.0] * 4, 4.1), ("b", "ddco", [-9.0, -8.0] * 2, 6.0), ("c", "mixture", [-20.0] * 4, 5.0)]
+    runs = [
+        ("a", "flat", [4.0] * 4, 4.1),
+        ("b", "ddco", [-9.0, -8.0] * 2, 6.0),
+        ("c", "mixture", [-20.0] * 4, 5.0),
+    ]
     rows = [row(name, rank, each, model, own) for rank, (name, model, each, own) in enumerate(runs)]
     known = Marginal(train=0.0, valid=-1.0, controls=2)
     said = comparison.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "b", known))
-    assert said.startswith("b fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training.")
+    assert said.startswith(
+        "b fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training."
+    )
     assert "c fell apart" in said
     assert "b is below a by 12.50 ± 0.29 nats per step" in said
     assert "options that last" not in said
@@ -133,7 +156,9 @@ def test_demonstrations_are_listed_worst_first_by_the_best_hierarchy(toy_run, fo
     assert [one["name"] for one in found.worst_first] == [held_out.names[n] for n in order]
     for one, n in zip(found.worst_first, order, strict=True):
         assert one["steps"] == held_out.lengths[n]
-        assert one["log_likelihood_per_step"] == pytest.approx({name: each[n] for name, each in values.items()})
+        assert one["log_likelihood_per_step"] == pytest.approx(
+            {name: each[n] for name, each in values.items()}
+        )
 
 
 def test_the_list_leads_to_the_segments_in_the_report(toy_run, toy_spec, tmp_path):
@@ -166,8 +191,14 @@ def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, othe
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"seed": 1}, r"not held out on the same data: demo_\d+ was held out by \S+ alone; fit both with the same"),
-        ({"demonstrations__valid_fraction": 0.0}, r"held nothing out \(demonstrations.valid_fraction: 0\); there is"),
+        (
+            {"seed": 1},
+            r"not held out on the same data: demo_\d+ was held out by \S+ alone; fit both with the same",
+        ),
+        (
+            {"demonstrations__valid_fraction": 0.0},
+            r"held nothing out \(demonstrations.valid_fraction: 0\); there is",
+        ),
     ],
     ids=["another split", "nothing held out"],
 )
@@ -195,9 +226,13 @@ def test_demonstrations_that_have_changed_since_are_refused(toy_spec, other, tmp
     second = load(shutil.copytree(first.folder, tmp_path / "second"))
     assert len(compare([first.folder, second.folder]).rows) == 2
     metrics = json.loads((first.folder / "metrics.json").read_text())
-    metrics["valid"][0]["log_likelihood"] += 1  # as where the code of a user's network says another one by now
+    metrics["valid"][0]["log_likelihood"] += (
+        1  # as where the code of a user's network says another one by now
+    )
     (first.folder / "metrics.json").write_text(json.dumps(metrics))
-    with pytest.raises(BadInput, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it"):
+    with pytest.raises(
+        BadInput, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it"
+    ):
         compare([first.folder, second.folder])
 
 
@@ -238,14 +273,19 @@ def rolled(toy_run, other, folders, tmp_path_factory):
 
 def successes(folder, method):
     with (folder / "rollouts.csv").open() as file:
-        return {int(one["seed"]): float(one["success"]) for one in csv.DictReader(file) if one["method"] == method}
+        return {
+            int(one["seed"]): float(one["success"]) for one in csv.DictReader(file) if one["method"] == method
+        }
 
 
 def test_rollouts_are_paired_by_initial_state(rolled):
     first, second, third = rolled
     flat = first.folder / "baselines" / "flat"
     found = compare([first.folder, flat, second.folder, third.folder])
-    outcomes = {str(first.folder): successes(first.folder, "ddco"), str(flat): successes(first.folder, "flat")}
+    outcomes = {
+        str(first.folder): successes(first.folder, "ddco"),
+        str(flat): successes(first.folder, "flat"),
+    }
     outcomes[str(second.folder)] = successes(second.folder, "ddco")
     order = [row.name for row in found.rows if row.name in outcomes]
     assert [(one["run"], one["other"]) for one in found.rollouts] == [(order[0], name) for name in order[1:]]
@@ -268,7 +308,9 @@ def test_the_command_and_the_files_say_the_same(folders, found, tmp_path):
     assert verdict == comparison.verdict(found)
     assert place == f"comparison: {folder / 'compare.html'}"
     data = json.loads((folder / "compare.json").read_text())
-    assert [(row["name"], row["total"]) for row in data["rows"]] == [(row.name, row.total) for row in found.rows]
+    assert [(row["name"], row["total"]) for row in data["rows"]] == [
+        (row.name, row.total) for row in found.rows
+    ]
     assert data["trajectories"] == list(found.trajectories)
     text = (folder / "compare.md").read_text()
     table = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("|")]

@@ -15,7 +15,8 @@ from ddco_pyro.errors import BadInput
 
 
 def labels(lengths, path, known=None, **said):
-    """Names of labels by label name; the name of each step by demonstration, empty where nothing is said; notes.
+    """Names of labels by label name; the name of each step by demonstration, empty where nothing is said;
+    notes.
 
     :param lengths: steps of each demonstration by its name.
     :param known: the names of labels that the source has.
@@ -28,7 +29,9 @@ def labels(lengths, path, known=None, **said):
     demos = Demonstrations.read(out)
     names = json.loads(demos.attributes["label_names"])
     found = {
-        demo.name: {key: [names[key][at] if at >= 0 else "" for at in steps] for key, steps in demo.labels.items()}
+        demo.name: {
+            key: [names[key][at] if at >= 0 else "" for at in steps] for key, steps in demo.labels.items()
+        }
         for demo in demos
     }
     return names, found, list(notes)
@@ -61,7 +64,9 @@ def test_any_table(tmp_path, kind, names, scale, said):
     if kind == "a.parquet":
         table.to_parquet(path)
     else:
-        table.to_csv(path, sep={"a.csv": ",", "a.tsv": "\t", "a.txt": ";"}[kind], index=False, encoding="utf-8-sig")
+        table.to_csv(
+            path, sep={"a.csv": ",", "a.tsv": "\t", "a.txt": ";"}[kind], index=False, encoding="utf-8-sig"
+        )
     columns = dict(zip(("demonstration", "label", "start", "stop"), table, strict=True))
     found = labels({"demo_0": 3, "demo_1": 8}, path, columns=columns, **said)
     assert found == (
@@ -103,7 +108,9 @@ def test_elan(tmp_path):
     assert found["demo_0"] == {"skill": [""] * 3, "who": [""] * 3}
 
 
-LOCATED = "Observation id\tTime offset (s)\tSubject\tBehavior\tBehavioral category\tModifier #1\tBehavior type"
+LOCATED = (
+    "Observation id\tTime offset (s)\tSubject\tBehavior\tBehavioral category\tModifier #1\tBehavior type"
+)
 AGGREGATED = f"""{LOCATED}\tStart (s)\tStop (s)\tDuration (s)
 demo_0\t5.0\tNo focal subject\treach\t\t\tSTATE\t5.000\t5.800\t0.800
 demo_0\t5.0\tNo focal subject\tbeep\t\t\tPOINT\t5.400\t5.400\tNA
@@ -112,7 +119,9 @@ demo_0\t5.0\tleft\tgrasp\t\t\tSTATE\t6.000\t6.300\t0.300
 """
 
 
-@pytest.mark.parametrize(("name", "text"), [("a.tsv", AGGREGATED), ("a.csv", "\ufeff" + AGGREGATED.replace("\t", ","))])
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.tsv", AGGREGATED), ("a.csv", "\ufeff" + AGGREGATED.replace("\t", ","))]
+)
 def test_boris(tmp_path, name, text):
     (tmp_path / name).write_text(text, encoding="utf-8")
     names, found, notes = labels({"demo_0": 14, "demo_1": 2}, tmp_path / name)
@@ -190,7 +199,9 @@ def test_label_studio(tmp_path, regions, unit, said):
     """Time series, whose ends are inclusive, frames of a video from 1 on, and audio; a task may have no region."""
     uploaded = "/data/upload/2/3f6a11c0-demo_1.csv?d=a"
     (tmp_path / "a.csv").write_text(exported((uploaded, regions), ("demo_0", []), key="csv"))
-    found = labels({"demo_0": 2, "demo_1": 9}, tmp_path / "a.csv", unit=unit, columns={"demonstration": "csv"})
+    found = labels(
+        {"demo_0": 2, "demo_1": 9}, tmp_path / "a.csv", unit=unit, columns={"demonstration": "csv"}
+    )
     assert found[1] == {"demo_0": {"label": ["", ""]}, "demo_1": {"label": said}}
 
 
@@ -245,7 +256,9 @@ def demos(tmp_path):
     """Two demonstrations whose labels were written by ``segment``, with other names, and no frequency."""
     path = tmp_path / "demos.hdf5"
     marks = {"skill": np.ones(12, int), "skill_boundary": np.ones(12, int), "phase": np.arange(12)}
-    each = tuple(Demonstration(f"demo_{n}", {"x": np.zeros((12, 1))}, np.ones((12, 2)), marks) for n in range(2))
+    each = tuple(
+        Demonstration(f"demo_{n}", {"x": np.zeros((12, 1))}, np.ones((12, 2)), marks) for n in range(2)
+    )
     Demonstrations(each).write(path)
     with h5py.File(path, "r+") as file:
         file.attrs["label_names"] = json.dumps({"skill": ["control", "reach"], "phase": ["a"]})
@@ -261,7 +274,11 @@ def test_labels_are_imported_beside_others(demos, tmp_path):
         names = json.loads(file.attrs["label_names"])
         assert names == {"skill": ["control", "reach", "grasp"], "phase": ["a"], "who": ["left hand"]}
         assert file.attrs["control_frequency"] == 10
-        assert set(file["data/demo_1/labels"]) == {"skill", "who", "phase"}  # boundaries of other labels are gone
+        assert set(file["data/demo_1/labels"]) == {
+            "skill",
+            "who",
+            "phase",
+        }  # boundaries of other labels are gone
         np.testing.assert_array_equal(file["data/demo_1/labels/skill"], [-1, 1, 1, 1, 2, 2, *[-1] * 6])
         np.testing.assert_array_equal(file["data/demo_0/labels/skill"], np.full(12, -1))
         np.testing.assert_array_equal(file["data/demo_0/labels/phase"], before["data/demo_0/labels/phase"])
@@ -280,7 +297,10 @@ def test_columns_and_the_unit_are_said(demos, tmp_path):
     (tmp_path / "out.hdf5").unlink()
     for more, said in (
         ([*columns, "--unit", "seconds"], "the demonstrations do not say how long a step is; add --fps"),
-        (["--columns", "demo=episode"], "--columns demo=episode: write demonstration=COLUMN,label=COLUMN,start=COLUMN"),
+        (
+            ["--columns", "demo=episode"],
+            "--columns demo=episode: write demonstration=COLUMN,label=COLUMN,start=COLUMN",
+        ),
         (columns, "does not say the unit of its times; add --unit seconds, milliseconds or steps"),
     ):
         refused(said, *asked, *more)
@@ -294,4 +314,6 @@ def test_a_missing_table_is_the_file_that_is_named(demos, tmp_path):
         (tmp_path / "no.csv", "is missing"),
         (tmp_path / "folder", "is a folder; give a table: CSV, TSV or Parquet"),
     ):
-        refused(f": --labels {path}: {said}\n", "import", demos, "--labels", path, "--out", tmp_path / "out.hdf5")
+        refused(
+            f": --labels {path}: {said}\n", "import", demos, "--labels", path, "--out", tmp_path / "out.hdf5"
+        )

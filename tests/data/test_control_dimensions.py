@@ -65,7 +65,11 @@ def resting(steps: int = STEPS) -> np.ndarray:
 @pytest.mark.parametrize("cuts", [[], [60, 150], [99]])
 def test_a_value_inside_the_range_is_counted_and_with_whom_it_is_taken(cuts: list[int]) -> None:
     first, second, third, fourth = control_dimensions(demonstrations(resting(), cuts))
-    assert [(each.inside, each.at_inside) for each in (first, second, third)] == [(0.25, 100), (0.0, 90), (0.0, 20)]
+    assert [(each.inside, each.at_inside) for each in (first, second, third)] == [
+        (0.25, 100),
+        (0.0, 90),
+        (0.0, 20),
+    ]
     assert [each.together for each in (first, second, third)] == [(1,), (0,), ()]
     assert first.note == "exactly 0.25 in 50.0 % of the steps"
     ends = "exactly at its minimum -1 in 10.0 % of the steps, at its maximum 1 in 10.0 % of the steps"
@@ -96,7 +100,11 @@ def test_a_limit_that_is_missed_by_rounding_is_reached(cuts: list[int], dtype: t
     assert (limit.at_minimum, limit.at_maximum, limit.inside) == (50, 50, None)
     assert (len(switch.values), rest.at_inside, still.constant) == (2, 67, True)
     parts = control_parts(ControlSpec(), found)
-    assert [(part.dims, part.kind) for part in parts] == [((0,), "clipped"), ((2,), "hurdle"), ((1,), "binary")]
+    assert [(part.dims, part.kind) for part in parts] == [
+        ((0,), "clipped"),
+        ((2,), "hurdle"),
+        ((1,), "binary"),
+    ]
     scaling = ControlScaling(ControlSpec(), 4, {3: still.minimum}, parts)
     scaled = scaling.scaled(demonstration)
     at = [np.isin(np.arange(STEPS) % 4, phases) for phases in ([0], [1])]
@@ -134,7 +142,9 @@ OTHERS = {
 @pytest.mark.parametrize("spoilt", [(3,), (3, 17)], ids=["one", "two"])
 @pytest.mark.parametrize("spoil", SPOILT)
 @pytest.mark.parametrize("others", OTHERS)
-def test_what_few_demonstrations_make_decides_no_kind(others: str, spoil: str, spoilt: tuple[int, ...]) -> None:
+def test_what_few_demonstrations_make_decides_no_kind(
+    others: str, spoil: str, spoilt: tuple[int, ...]
+) -> None:
     """It is said of whom it is; what half of them make decides the kind as it did."""
     random, spoiling = np.random.default_rng(0), SPOILT[spoil]
     made = {f"demo_{n}": OTHERS[others](random) for n in range(20)}

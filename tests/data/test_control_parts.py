@@ -15,7 +15,8 @@ from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, with_overrides
 
 
 def mixed(seed=0, steps=30):
-    """[T, 5]: free, at bounds ±2 and within, a switch between 0.1 and 0.7, at its upper bound alone, constant.
+    """[T, 5]: free, at bounds ±2 and within, a switch between 0.1 and 0.7, at its upper bound alone,
+    constant.
 
     The constant is no float32.
     """
@@ -89,7 +90,10 @@ def test_two_discrete_columns_are_a_distribution_and_act_in_exports_as_in_the_ru
         made.append(Demonstration(f"demo_{n}", {"state": whole(n) + noise}, whole(n)))
     fit = ddco_pyro.fit(spec_of(), Demonstrations(tuple(made)))
     actions = np.stack(np.meshgrid([-1, 0, 1], [0, 1, 2]), axis=-1).reshape(-1, 2)
-    each = [Demonstration(f"demo_{n}", {"state": np.zeros((1, 2))}, action[None]) for n, action in enumerate(actions)]
+    each = [
+        Demonstration(f"demo_{n}", {"state": np.zeros((1, 2))}, action[None])
+        for n, action in enumerate(actions)
+    ]
     np.testing.assert_allclose(np.exp(fit.log_likelihood(Demonstrations(tuple(each)))).sum(), 1.0, rtol=1e-6)
     controller = Controller(fit.hierarchy, "sample")
     controller.reset(0)
@@ -110,7 +114,10 @@ def test_parts_by_name_come_first_and_the_rest_follows():
         ({"kind": "binary"}, "control.kind: control dimension 0 takes more than two values; it is no switch"),
         ({"kind": "hurdle"}, "control dimension 0 is at no value inside its range in 5 % of the steps"),
         ({"parts": [{"name": "a", "dims": [9]}]}, "control.parts.0.dims: there is no control dimension 9"),
-        ({"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]}, "control dimension 0 is not of whole"),
+        (
+            {"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]},
+            "control dimension 0 is not of whole",
+        ),
     ],
 )
 def test_what_does_not_fit_the_demonstrations_is_refused(control, message):
@@ -160,7 +167,9 @@ def resting_spec(options=3, epochs=6, **control):
 
 @pytest.fixture(scope="module")
 def rested(tmp_path_factory):
-    return ddco_pyro.fit(resting_spec(2, epochs=40), resting(), out=tmp_path_factory.mktemp("runs") / "rested")
+    return ddco_pyro.fit(
+        resting_spec(2, epochs=40), resting(), out=tmp_path_factory.mktemp("runs") / "rested"
+    )
 
 
 def test_switches_and_bounds_are_emitted_exactly(fitted):
@@ -169,7 +178,9 @@ def test_switches_and_bounds_are_emitted_exactly(fitted):
     controls = []
     for seed in range(8):
         controller.reset(seed)
-        controls += [controller.act({"state": row}) for row in np.random.default_rng(seed).normal(0, 50, (20, 5))]
+        controls += [
+            controller.act({"state": row}) for row in np.random.default_rng(seed).normal(0, 50, (20, 5))
+        ]
     emitted = np.stack(controls)
     assert set(emitted[:, 2]) == {0.1, 0.7}
     assert set(emitted[:, 4]) == {0.1}
@@ -197,7 +208,9 @@ MEASURES = {
 def test_what_was_decided_comes_back_from_the_run(run):
     again = ddco_pyro.load(run.folder)
     assert again.hierarchy.scaling.parts == run.hierarchy.scaling.parts
-    np.testing.assert_array_equal(again.log_likelihood(run.demonstrations), run.log_likelihood(run.demonstrations))
+    np.testing.assert_array_equal(
+        again.log_likelihood(run.demonstrations), run.log_likelihood(run.demonstrations)
+    )
     assert again.metrics.measure == MEASURES[run.folder.name]
     assert again.metrics.engine_check.value < 1e-6
 
@@ -212,7 +225,9 @@ def test_exports_act_as_the_run_does(run, tmp_path, control):
     seen = np.random.default_rng(3).normal(0, 1.5, (150, *size))
     ours, theirs = (np.stack([acts.act({"state": row}) for row in seen]) for acts in (exported, original))
     np.testing.assert_allclose(ours, theirs, atol=1e-5)
-    np.testing.assert_array_equal(np.where(np.isin(ours, exact), ours, 9), np.where(np.isin(theirs, exact), theirs, 9))
+    np.testing.assert_array_equal(
+        np.where(np.isin(ours, exact), ours, 9), np.where(np.isin(theirs, exact), theirs, 9)
+    )
     if run.folder.name == "rested":
         rests = ours[:, 1] == STILL
         assert 0.1 < rests.mean() < 0.9
@@ -228,7 +243,9 @@ def in_file(spec, path, **changes):
 
 def test_a_value_that_a_switch_does_not_have_is_one_line(fitted):
     broken = demonstrations(lambda n: np.where(np.arange(5) == 2, 0.5, mixed(n)), number=1)
-    with pytest.raises(DemonstrationsError, match=r"2 is 0\.5 at step 0, .*; repair it, or leave demo_0 out$"):
+    with pytest.raises(
+        DemonstrationsError, match=r"2 is 0\.5 at step 0, .*; repair it, or leave demo_0 out$"
+    ):
         fitted.log_likelihood(broken)
 
 
@@ -238,7 +255,11 @@ def test_different_measures_are_not_ranked(fitted, tmp_path):
     runs = []
     for kind in ("auto", "gaussian"):
         runs.append(ddco_pyro.fit(in_file(spec_of(kind=kind), path), out=tmp_path / kind).folder)
-    refused("control dimension 1 is clipped with bounds -2 and 2 in one and gaussian in the other", "compare", *runs)
+    refused(
+        "control dimension 1 is clipped with bounds -2 and 2 in one and gaussian in the other",
+        "compare",
+        *runs,
+    )
     grid = in_file(spec_of(), path, selection={"folds": 2, "grid": {"control.kind": ["auto", "gaussian"]}})
     (tmp_path / "grid.yaml").write_text(dump_spec(grid))
     said = "kind = auto and kind = gaussian measure different things: control dimension 1"
@@ -246,7 +267,8 @@ def test_different_measures_are_not_ranked(fitted, tmp_path):
 
 
 def no_ops(number=8, steps=30, dimensions=3, at_once=True):
-    """A teleoperator who rests, without any skill: in half of the steps the control is exactly 0, else it is normal.
+    """A teleoperator who rests, without any skill: in half of the steps the control is exactly 0, else it is
+    normal.
 
     :param at_once: in all dimensions at once; else in each by itself.
     """
@@ -262,8 +284,8 @@ def no_ops(number=8, steps=30, dimensions=3, at_once=True):
 def test_without_skill_options_gain_nothing(at_once):
     """Half of the steps are exactly 0 at random: three options and a flat policy, held out, nats per step.
 
-    With Gaussian controls the options seem better by more than a nat; with a probability at 0 the difference is
-    within three of its standard errors, which are below 0.025.
+    With Gaussian controls the options seem better by more than a nat; with a probability at 0 the difference
+    is within three of its standard errors, which are below 0.025.
     """
     demos, gained = no_ops(30, at_once=at_once), {}
     for kind in ("gaussian", "auto"):

@@ -35,7 +35,7 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "demos.hdf5"
 
 
-# --- robomimic --------------------------------------------------------------------------------------------------------
+# --- robomimic ----------------------------------------------------------------------------------------------
 
 
 def test_a_file_of_robomimics_is_read_as_it_is() -> None:
@@ -44,7 +44,11 @@ def test_a_file_of_robomimics_is_read_as_it_is() -> None:
         for demo in demos:
             np.testing.assert_array_equal(demo.actions, file[f"data/{demo.name}/actions"])
             np.testing.assert_array_equal(demo.observations["object"], file[f"data/{demo.name}/obs/object"])
-    assert demos.observation_shapes == {"agentview_image": (12, 10, 3), "object": (2,), "robot0_eef_pos": (2,)}
+    assert demos.observation_shapes == {
+        "agentview_image": (12, 10, 3),
+        "object": (2,),
+        "robot0_eef_pos": (2,),
+    }
     assert set(demos.masks) == {"train", "valid", "better"}
     assert inspect(ROBOMIMIC).frequency == 20
 
@@ -88,7 +92,7 @@ def test_a_filter_key_some_observations_and_smaller_pictures(out: Path) -> None:
     np.testing.assert_allclose(demos[0].observations["agentview_image"], halved, atol=1)
 
 
-# --- LeRobot ----------------------------------------------------------------------------------------------------------
+# --- LeRobot ------------------------------------------------------------------------------------------------
 
 
 def test_lerobot_without_its_videos(out: Path) -> None:
@@ -99,7 +103,9 @@ def test_lerobot_without_its_videos(out: Path) -> None:
     for episode, demo in enumerate(demos):
         steps = np.arange(len(demo))
         np.testing.assert_array_equal(demo.observations["state"][:, :2], [[episode, step] for step in steps])
-        np.testing.assert_allclose(demo.actions, np.stack([0.1 * steps, np.full(len(demo), -0.1 * episode)], 1), 1e-6)
+        np.testing.assert_allclose(
+            demo.actions, np.stack([0.1 * steps, np.full(len(demo), -0.1 * episode)], 1), 1e-6
+        )
         picture = demo.observations["images/wrist"]
         assert (picture[..., 0] == 50 * episode).all()
         assert (picture[:, 0, 0, 1:] == 10 * steps[:, None]).all()
@@ -163,7 +169,9 @@ def test_what_is_not_chosen_is_not_read(change: odd.Change, tmp_path: Path, out:
 
 
 @pytest.mark.parametrize("index", [True, False], ids=["an index of pandas", "a column"])
-def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(index: bool, tmp_path: Path, out: Path) -> None:
+def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(
+    index: bool, tmp_path: Path, out: Path
+) -> None:
     """Subtasks have a table of names, of which one number is missing; the task of the last episode changes."""
     column = "__index_level_0__" if index else "subtask"
     names = pyarrow.table({"subtask_index": [2, 0], column: ["lift", "reach"]})
@@ -171,7 +179,9 @@ def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(index: bool
     def framed(table: pyarrow.Table) -> pyarrow.Table:
         tasks = table["task_index"].to_pylist()
         tasks[-3:] = [0, 0, 0]
-        table = table.set_column(table.schema.get_field_index("task_index"), "task_index", pyarrow.array(tasks))
+        table = table.set_column(
+            table.schema.get_field_index("task_index"), "task_index", pyarrow.array(tasks)
+        )
         return table.append_column("subtask_index", pyarrow.array([2 * (n % 2) for n in range(len(table))]))
 
     def both(table: pyarrow.Table) -> pyarrow.Table:
@@ -194,8 +204,14 @@ def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(index: bool
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda dataset: (dataset / odd.VIDEO).unlink(), r"file-000\.mp4: the video is missing; leave its observation"),
-        (odd.feature("observation.images.top", dtype="video", shape=[11, 12, 3]), r"mp4: is \d+ x \d+, and meta/info"),
+        (
+            lambda dataset: (dataset / odd.VIDEO).unlink(),
+            r"file-000\.mp4: the video is missing; leave its observation",
+        ),
+        (
+            odd.feature("observation.images.top", dtype="video", shape=[11, 12, 3]),
+            r"mp4: is \d+ x \d+, and meta/info",
+        ),
         (
             lambda dataset: (dataset / odd.DATA).write_bytes((dataset / odd.DATA).read_bytes()[:-100]),
             r"demo_0: cannot be read, or is damaged",
@@ -203,14 +219,16 @@ def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(index: bool
     ],
     ids=["no video", "small video", "damaged data"],
 )
-def test_a_damaged_lerobot_dataset_is_refused(tmp_path: Path, out: Path, change: odd.Change, message: str) -> None:
+def test_a_damaged_lerobot_dataset_is_refused(
+    tmp_path: Path, out: Path, change: odd.Change, message: str
+) -> None:
     dataset = odd.changed(change)(tmp_path)
     with pytest.raises(DemonstrationsError, match=message):
         import_demonstrations(dataset, out, choice=Choice(videos=True))
     assert not out.exists()
 
 
-# --- Minari -----------------------------------------------------------------------------------------------------------
+# --- Minari -------------------------------------------------------------------------------------------------
 
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari.*")
@@ -234,7 +252,9 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         random = np.random.default_rng(0)
         arm = spaces.Dict({"joints": spaces.Box(-9, 9, (3,), np.float64)})
         camera = spaces.Box(0, 255, (32, 32, 3), np.uint8)
-        space = spaces.Dict({"arm": arm, "camera": camera, "goal": spaces.Discrete(4), "mission": spaces.Text(30)})
+        space = spaces.Dict(
+            {"arm": arm, "camera": camera, "goal": spaces.Discrete(4), "mission": spaces.Text(30)}
+        )
         action.seed(0)
         buffers = []
         for episode in range(4):
@@ -248,9 +268,13 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             actions = batched([action.sample() for _ in range(steps)])
             ends = np.arange(steps) == steps - 1
             buffers.append(
-                EpisodeBuffer(episode, 7 + episode, None, observations, actions, np.ones(steps), ends, ~ends, {})
+                EpisodeBuffer(
+                    episode, 7 + episode, None, observations, actions, np.ones(steps), ends, ~ends, {}
+                )
             )
-        minari.create_dataset_from_buffers("arm/reach-v0", buffers, observation_space=space, action_space=action)
+        minari.create_dataset_from_buffers(
+            "arm/reach-v0", buffers, observation_space=space, action_space=action
+        )
         return tmp_path / "arm" / "reach-v0", buffers
 
     return make
@@ -258,15 +282,21 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_minari(written_by_minari, out: Path) -> None:
     folder, buffers = written_by_minari(spaces.Box(-1, 1, (2,)))
-    assert import_demonstrations(folder, out).notes == ("networks do not read obs/mission: it holds text, not numbers",)
+    assert import_demonstrations(folder, out).notes == (
+        "networks do not read obs/mission: it holds text, not numbers",
+    )
     assert "obs/mission holds text, not numbers" in inspect(folder).problems
     demos = Demonstrations.read(out)
     assert demos.lengths == (5, 6, 7, 8)
     for buffer, demo in zip(buffers, demos, strict=True):
         np.testing.assert_array_equal(demo.actions, buffer.actions)
-        np.testing.assert_array_equal(demo.observations["arm/joints"], buffer.observations["arm"]["joints"][:-1])
+        np.testing.assert_array_equal(
+            demo.observations["arm/joints"], buffer.observations["arm"]["joints"][:-1]
+        )
         np.testing.assert_array_equal(demo.observations["goal"][:, 0], buffer.observations["goal"][:-1])
-        np.testing.assert_allclose(demo.observations["camera"], buffer.observations["camera"][:-1], atol=2)  # JPEG
+        np.testing.assert_allclose(
+            demo.observations["camera"], buffer.observations["camera"][:-1], atol=2
+        )  # JPEG
         assert demo.attributes["seed"] == buffer.seed
     for other in (folder / "data", folder / "data" / "main_data.hdf5"):
         assert inspect(other).format == "minari"
@@ -285,13 +315,17 @@ def test_minari_with_nested_actions(written_by_minari, out: Path) -> None:
     out.unlink()
     import_demonstrations(folder, out, choice=Choice(actions=("hands/0", "arm/base")))
     np.testing.assert_array_equal(Demonstrations.read(out)[3].actions, np.hstack([grasp[:, None], base]))
-    with pytest.raises(DemonstrationsError, match=r"no action 'hand/0' \(did you mean 'hands/0'\?\); there is: arm"):
+    with pytest.raises(
+        DemonstrationsError, match=r"no action 'hand/0' \(did you mean 'hands/0'\?\); there is: arm"
+    ):
         import_demonstrations(folder, out.with_name("x"), choice=Choice(actions=("hand/0",)))
 
 
 def test_minaris_text_is_no_control(written_by_minari, out: Path) -> None:
     folder, _ = written_by_minari(spaces.Dict({"jaw": spaces.Box(-1, 1, (1,)), "say": spaces.Text(5)}))
-    with pytest.raises(DemonstrationsError, match=r"demo_0: say holds <U5, not numbers; name the control with"):
+    with pytest.raises(
+        DemonstrationsError, match=r"demo_0: say holds <U5, not numbers; name the control with"
+    ):
         import_demonstrations(folder, out)
     import_demonstrations(folder, out, choice=Choice(actions=("jaw",)))
     assert Demonstrations.read(out).control_size == 1
@@ -304,13 +338,15 @@ def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None
     metadata = json.loads(path.read_text())
     del metadata["observation_space"]
     path.write_text(json.dumps(metadata | {"env_spec": '{"id": "x-v0", "entry_point": "antigravity:x"}'}))
-    with pytest.raises(DemonstrationsError, match=r"metadata\.json does not say its observation and action spaces"):
+    with pytest.raises(
+        DemonstrationsError, match=r"metadata\.json does not say its observation and action spaces"
+    ):
         import_demonstrations(folder, out)
 
 
 def test_minaris_episodes_and_steps_are_counted(written_by_minari, out: Path) -> None:
-    """One episode was not stored to its end, one says that it is longer, one has an observation too many; then one is
-    gone.
+    """One episode was not stored to its end, one says that it is longer, one has an observation too many;
+    then one is gone.
     """
     folder, _ = written_by_minari(spaces.Box(-1, 1, (2,)))
     with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
@@ -329,11 +365,13 @@ def test_minaris_episodes_and_steps_are_counted(written_by_minari, out: Path) ->
         assert message in left_out[name]
     with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
         del file["episode_1"]
-    with pytest.raises(DemonstrationsError, match="counts 4 episodes, and the dataset has 3; correct total_episodes"):
+    with pytest.raises(
+        DemonstrationsError, match="counts 4 episodes, and the dataset has 3; correct total_episodes"
+    ):
         inspect(folder)
 
 
-# --- JIGSAWS ---------------------------------------------------------------------------------------------------------
+# --- JIGSAWS ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -350,7 +388,9 @@ def surgeons(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
         trials.append(rows.round(8))
     (folder / "transcriptions" / "Knot_Tying_B001.txt").write_text("3 12 G12 \n13 30 G2 \n")
     (folder / "transcriptions" / "Knot_Tying_C002.txt").write_text("1 24 G11\n\n")
-    (folder / "meta_file_Knot_Tying.txt").write_text("Knot_Tying_B001\t\tN\t\t13\t\t2\nKnot_Tying_C002\t\tE\t\t20\n\n")
+    (folder / "meta_file_Knot_Tying.txt").write_text(
+        "Knot_Tying_B001\t\tN\t\t13\t\t2\nKnot_Tying_C002\t\tE\t\t20\n\n"
+    )
     return folder, trials
 
 
@@ -394,14 +434,32 @@ def test_a_source_at_a_lower_rate(surgeons, out: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "more", "message"),
     [
-        (("transcriptions/Knot_Tying_B001.txt", "3 x G12"), (), "Knot_Tying_B001.txt: row 1 is no FIRST LAST GESTURE"),
+        (
+            ("transcriptions/Knot_Tying_B001.txt", "3 x G12"),
+            (),
+            "Knot_Tying_B001.txt: row 1 is no FIRST LAST GESTURE",
+        ),
         (("kinematics/AllGestures/Knot_Tying_B001.txt", ""), (), "Knot_Tying_B001.txt is empty"),
-        (("kinematics/AllGestures/Knot_Tying_B001.txt", "1 2"), (), "rows of 2 numbers, where JIGSAWS has 76"),
-        (("kinematics/AllGestures/Knot_Tying_B001.txt", "1 a"), (), "Knot_Tying_B001.txt is no table of numbers"),
-        (None, ("--hz", "20"), "--hz 20: the source has 30 Hz; give a whole part of that, such as 15, 10, 7.5, 6"),
+        (
+            ("kinematics/AllGestures/Knot_Tying_B001.txt", "1 2"),
+            (),
+            "rows of 2 numbers, where JIGSAWS has 76",
+        ),
+        (
+            ("kinematics/AllGestures/Knot_Tying_B001.txt", "1 a"),
+            (),
+            "Knot_Tying_B001.txt is no table of numbers",
+        ),
+        (
+            None,
+            ("--hz", "20"),
+            "--hz 20: the source has 30 Hz; give a whole part of that, such as 15, 10, 7.5, 6",
+        ),
     ],
 )
-def test_what_is_wrong_with_surgeons_files_is_one_line(surgeons, out: Path, change, more, message: str) -> None:
+def test_what_is_wrong_with_surgeons_files_is_one_line(
+    surgeons, out: Path, change, more, message: str
+) -> None:
     folder, _ = surgeons
     if change:
         (folder / change[0]).write_text(change[1])
@@ -409,14 +467,16 @@ def test_what_is_wrong_with_surgeons_files_is_one_line(surgeons, out: Path, chan
     assert not out.exists()
 
 
-# --- whole or not at all ----------------------------------------------------------------------------------------------
+# --- whole or not at all ------------------------------------------------------------------------------------
 
 
 class Stopped(Exception):
     pass
 
 
-def test_an_interrupted_import_leaves_nothing_and_one_that_is_there_is_not_replaced(out: Path, tmp_path: Path) -> None:
+def test_an_interrupted_import_leaves_nothing_and_one_that_is_there_is_not_replaced(
+    out: Path, tmp_path: Path
+) -> None:
     def stop(event: Counted) -> None:
         if event.done == 3:
             raise Stopped
@@ -430,7 +490,7 @@ def test_an_interrupted_import_leaves_nothing_and_one_that_is_there_is_not_repla
         import_demonstrations(ROBOMIMIC, out)
 
 
-# --- what cannot be used ----------------------------------------------------------------------------------------------
+# --- what cannot be used ------------------------------------------------------------------------------------
 
 
 def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path) -> None:
@@ -457,11 +517,23 @@ def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--mask", "bettr"], "there is no mask 'bettr' (did you mean 'better'?); there is: better, train, valid"),
-        (["--observation", "objct"], "demo_0: there is no observation 'objct' (did you mean 'object'?); there is: "),
+        (
+            ["--mask", "bettr"],
+            "there is no mask 'bettr' (did you mean 'better'?); there is: better, train, valid",
+        ),
+        (
+            ["--observation", "objct"],
+            "demo_0: there is no observation 'objct' (did you mean 'object'?); there is: ",
+        ),
         (["--format", "lerobot"], "info.json: cannot be read, or is damaged"),
-        (["--format", "roboimic"], "there is no format 'roboimic' (did you mean 'robomimic'?); there is: lerobot, "),
-        (["--action", "actions"], "has the format robomimic, with one control; --action is for the folder of a Le"),
+        (
+            ["--format", "roboimic"],
+            "there is no format 'roboimic' (did you mean 'robomimic'?); there is: lerobot, ",
+        ),
+        (
+            ["--action", "actions"],
+            "has the format robomimic, with one control; --action is for the folder of a Le",
+        ),
         (["--image-size", "3"], "Invalid value for '--image-size'"),
     ],
 )

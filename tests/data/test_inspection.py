@@ -38,7 +38,11 @@ RATES: dict[str, tuple[str, object, float | None]] = {
     "text": ("data", {"fps": "50 Hz"}, 50),
     "a period": ("", {"dt": 0.02}, 50),
     "of the environment": ("data", {"env_args": json.dumps({"env_kwargs": {"control_freq": 40}})}, 40),
-    "beside the environment": ("data", {"env_args": json.dumps({"control_freq": 40, "env_kwargs": None})}, 40),
+    "beside the environment": (
+        "data",
+        {"env_args": json.dumps({"control_freq": 40, "env_kwargs": None})},
+        40,
+    ),
     "none": ("", {"fps": 0}, None),
     "no number": ("", {"fps": "fast", "hz": float("nan"), "rate": True, "dt": float("inf")}, None),
 }
@@ -53,7 +57,9 @@ def test_the_rate_is_read_under_usual_names(
         (file[place] if place else file).attrs.update(said)
     assert inspect(path).frequency == hertz
     shown = call("inspect", path).out
-    assert (f"control frequency: {hertz:g} Hz\n" if hertz else 'file.attrs["control_frequency"] = 20 says') in shown
+    assert (
+        f"control frequency: {hertz:g} Hz\n" if hertz else 'file.attrs["control_frequency"] = 20 says'
+    ) in shown
 
 
 def test_shapes_ranges_lengths_and_constants(path: Path) -> None:
@@ -108,7 +114,10 @@ def test_the_command_shows_it_and_a_spec(path: Path) -> None:
     assert (ended.status, ended.err) == (0, "")
     assert "robomimic, 5 demonstrations of 3 to 6 steps (median 4, 21 in all)" in ended.out
     assert "control frequency: 20 Hz" in ended.out
-    rows = {line.split("│")[0].strip(): [c.strip() for c in line.split("│")[1:]] for line in ended.out.splitlines()}
+    rows = {
+        line.split("│")[0].strip(): [c.strip() for c in line.split("│")[1:]]
+        for line in ended.out.splitlines()
+    }
     assert rows["obs/fixed"] == ["[3]", "float32", "1 to 3", "constant"]
     assert rows["actions"][-1] == "constant: 1"
     assert "observations:" in ended.out
@@ -128,7 +137,9 @@ NOTES: dict[str, list[str]] = {
         "control dimension 0: -0.30100668315876145 is common in demo_2 alone",
         "control dimension 1: -0.38171402837921675 is common in demo_3 alone",
     ],
-    "a demonstration twice": ["1 of 5 demonstrations equal another one, the first demo_4, which equals demo_0: one of"],
+    "a demonstration twice": [
+        "1 of 5 demonstrations equal another one, the first demo_4, which equals demo_0: one of"
+    ],
     "an observation that is the control": ["obs/command is control dimensions 0-1 at the same step, up to"],
     "a switch padded by zeros": [
         "control dimension 2: exactly 0 in 29.4 % of the steps; exactly at its minimum -1 in 47.1"
@@ -149,7 +160,9 @@ def test_what_coincides_is_noted_once(name: str, notes: list[str], tmp_path: Pat
 
 
 @pytest.mark.parametrize(("shift", "left_out"), [(-1, False), (0, True), (1, True)])
-def test_a_control_among_other_numbers_is_noted_and_alone_left_out(shift: int, left_out: bool, tmp_path: Path) -> None:
+def test_a_control_among_other_numbers_is_noted_and_alone_left_out(
+    shift: int, left_out: bool, tmp_path: Path
+) -> None:
     """It is that of the step before, of the same one, or of the next; beside it is a number of its own."""
 
     def change(made: dict[str, np.ndarray], number: int) -> None:
@@ -174,7 +187,9 @@ def test_a_control_among_other_numbers_is_noted_and_alone_left_out(shift: int, l
 
 def test_copies_are_noted_where_the_masks_part_them(tmp_path: Path) -> None:
     def noted(**masks: list[bytes]) -> bool:
-        return any("equal another one" in note for note in inspect(write(tmp_path / "d.hdf5", twins, masks)).notes)
+        return any(
+            "equal another one" in note for note in inspect(write(tmp_path / "d.hdf5", twins, masks)).notes
+        )
 
     assert noted(valid=[b"demo_0"])
     assert noted(train=[b"demo_0", b"demo_1"], valid=[b"demo_4"])
@@ -182,7 +197,7 @@ def test_copies_are_noted_where_the_masks_part_them(tmp_path: Path) -> None:
     assert not noted(valid=[b"demo_0", b"demo_4"])
 
 
-# --- odd demonstrations -----------------------------------------------------------------------------------------------
+# --- odd demonstrations -------------------------------------------------------------------------------------
 
 
 def arm(steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
@@ -231,7 +246,9 @@ ODD: dict[str, tuple[Spoil, str]] = {
 
 @pytest.mark.parametrize(("name", "spoilt"), [("dead", (3,)), *((name, (3, 11)) for name in ODD)])
 @pytest.mark.usefixtures("undecided")
-def test_an_odd_demonstration_is_named_and_left_out(name: str, spoilt: tuple[int, ...], tmp_path: Path) -> None:
+def test_an_odd_demonstration_is_named_and_left_out(
+    name: str, spoilt: tuple[int, ...], tmp_path: Path
+) -> None:
     spoil, why = ODD[name]
     path = recorded(tmp_path / "demos.hdf5", spoil, spoilt)
     names = [f"demo_{number}" for number in spoilt]
@@ -281,6 +298,6 @@ def test_the_fault_of_a_clock_is_named(times: list[float], line: str, tmp_path: 
     ]
     Demonstrations(tuple(demos)).write(tmp_path / "demos.hdf5")
     assert "obs/timestamp" in inspect(tmp_path / "demos.hdf5").leaks
-    assert [note for note in inspect(tmp_path / "demos.hdf5").notes if "timestamp" in note and "row" in note] == [
-        line
-    ] * bool(line)
+    assert [
+        note for note in inspect(tmp_path / "demos.hdf5").notes if "timestamp" in note and "row" in note
+    ] == [line] * bool(line)

@@ -83,7 +83,11 @@ def test_an_episode_that_is_not_whole_is_named_and_can_be_skipped(name: str, tmp
     ("times", "message", "broken"),
     [
         (range(12), "demo_2: .* has 1 frames from second 1.1 on, and 7 are needed", ["demo_2", "demo_3"]),
-        ([*range(7), *range(8, 27)], "demo_1: .* has no frame of step 2: the next one is at second 0.8", ["demo_1"]),
+        (
+            [*range(7), *range(8, 27)],
+            "demo_1: .* has no frame of step 2: the next one is at second 0.8",
+            ["demo_1"],
+        ),
     ],
 )
 def test_episodes_without_all_of_their_frames_are_named_or_left_out(
@@ -94,14 +98,16 @@ def test_episodes_without_all_of_their_frames_are_named_or_left_out(
         import_demonstrations(dataset, tmp_path / "demos.hdf5", choice=Choice(("images/top",)))
     choice = Choice(("images/top",), skip_broken=True)
     left_out = import_demonstrations(dataset, tmp_path / "demos.hdf5", choice=choice).left_out
-    assert left_out.keys() | {*Demonstrations.read(tmp_path / "demos.hdf5").names} == {f"demo_{n}" for n in range(4)}
+    assert left_out.keys() | {*Demonstrations.read(tmp_path / "demos.hdf5").names} == {
+        f"demo_{n}" for n in range(4)
+    }
     assert [*left_out] == broken
 
 
 def test_rows_of_an_episode_that_is_not_named_are_not_annotated(tmp_path: Path, run: Path) -> None:
-    dataset = odd.changed(odd.rewritten(odd.EPISODES, lambda table: table.slice(0, 3)), odd.info(total_episodes=3))(
-        tmp_path
-    )
+    dataset = odd.changed(
+        odd.rewritten(odd.EPISODES, lambda table: table.slice(0, 3)), odd.info(total_episodes=3)
+    )(tmp_path)
     ended = call("segment", run, dataset, "--lerobot", tmp_path / "annotated")
     refused(ended, "rows of episode 3 that meta/episodes does not name")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset"]

@@ -111,7 +111,9 @@ def test_signals_of_subtasks_are_labels(place: str, tmp_path: Path) -> None:
             del group["labels"]
             group[f"{place}/subtask_term_signals/reach"] = (steps >= 4 + number).astype(int)
             group[f"{place}/subtask_term_signals/grasp"] = (steps >= 9).astype(int)
-    expected = [np.repeat([0, 1, 2], [5 + n, 5 - n, len(demo) - 10]) for n, demo in enumerate(pick_and_place(6))][:5]
+    expected = [
+        np.repeat([0, 1, 2], [5 + n, 5 - n, len(demo) - 10]) for n, demo in enumerate(pick_and_place(6))
+    ][:5]
     for read in (Demonstrations.read(path), Demonstrations.read(path, ["gripper"], ["subtask"])):
         for demo, labels in zip(read, expected, strict=False):
             assert demo.labels["subtask"].tolist() == labels.tolist()

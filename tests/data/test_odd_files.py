@@ -64,7 +64,12 @@ ELSEWHERE = ("kinds", "layouts")
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in ROWS if not name.startswith(ELSEWHERE) and name.removeprefix("lerobot: ") not in TESTED]
+    "name",
+    [
+        name
+        for name in ROWS
+        if not name.startswith(ELSEWHERE) and name.removeprefix("lerobot: ") not in TESTED
+    ],
 )
 @pytest.mark.usefixtures("undecided")  # but once, in ``warm``
 def test_an_odd_file(name: str, tmp_path: Path, warm: Path) -> None:
@@ -95,7 +100,9 @@ def test_an_odd_file(name: str, tmp_path: Path, warm: Path) -> None:
         assert stayed, shown
         assert wrote <= {"written", "spec.yaml"}, shown
         if command[0] not in ASIDE or path.suffix == ".yaml":
-            refused += [command[0]] if ended.status and (row.says is not None or command[0] != "import") else []
+            refused += (
+                [command[0]] if ended.status and (row.says is not None or command[0] != "import") else []
+            )
             if row.says is not None and (ended.status or command == ("inspect", path)):
                 assert re.search(row.says, ended.err + ended.out), shown
     assert (row.says is None) == (not refused), refused

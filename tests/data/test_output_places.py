@@ -57,7 +57,9 @@ COMMANDS = {
     "fit": Command("fit toy.yaml --out", "toy.yaml", folder=True),
     "collect": Command("collect toy.yaml --out", "toy.yaml"),
     "init": Command("init demos.hdf5 --force --out", "demos.hdf5"),
-    "encode": Command("encode demos.hdf5 --observation camera --encoder timm:resnet18.a1_in1k --out", "demos.hdf5"),
+    "encode": Command(
+        "encode demos.hdf5 --observation camera --encoder timm:resnet18.a1_in1k --out", "demos.hdf5"
+    ),
     "import": Command("import demos.hdf5 --out", "demos.hdf5"),
 }
 
@@ -115,7 +117,7 @@ def test_two_outputs_of_one_name_are_refused(inputs: Path, tmp_path: Path, monke
     assert [path.name for path in tmp_path.iterdir()] == ["link"]
 
 
-# --- what is there already --------------------------------------------------------------------------------------------
+# --- what is there already ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -140,7 +142,9 @@ def test_no_file_but_a_labelled_copy_is_replaced(toy_run, file: Path, tmp_path: 
     done("segment", toy_run.folder, other, "--out", copy)
     for there in (other, copy):
         before = there.read_bytes()
-        says = f"--out {there}: exists and is not a labelled copy of {file}; choose another --out, or remove it"
+        says = (
+            f"--out {there}: exists and is not a labelled copy of {file}; choose another --out, or remove it"
+        )
         refused(says, "segment", toy_run.folder, file, "--out", there)
         assert there.read_bytes() == before
 
@@ -178,7 +182,7 @@ def test_collect_takes_only_its_own_file_for_done(tmp_path: Path, cache) -> None
     refused("is there already and does not hold these demonstrations", "collect", spec, "--out", out)
 
 
-# --- what is written --------------------------------------------------------------------------------------------------
+# --- what is written ----------------------------------------------------------------------------------------
 
 
 def test_a_name_that_is_a_formula_is_quoted_in_csv(toy_run, file: Path, tmp_path: Path) -> None:
@@ -193,7 +197,7 @@ def test_a_name_that_is_a_formula_is_quoted_in_csv(toy_run, file: Path, tmp_path
     assert not [cell for cell in first if cell.startswith(("=", "+", "-", "@"))]
 
 
-# --- what is said and what is asked for -------------------------------------------------------------------------------
+# --- what is said and what is asked for ---------------------------------------------------------------------
 
 
 def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path, monkeypatch) -> None:
@@ -222,5 +226,7 @@ def test_commands_are_printed_as_a_shell_takes_them(tmp_path: Path, monkeypatch)
     assert shlex.split(said) == ["ddco-pyro", "init", "a b.hdf5", "--out", "a b.yaml"]
     said = call(*shlex.split(said)[1:]).out.partition("fit it with: ")[2]
     assert shlex.split(said) == ["ddco-pyro", "fit", "a b.yaml", "--out", "runs/a b"]
-    assert "# Fit it:              ddco-pyro fit 'a b.yaml' --out runs/first\n" in Path("a b.yaml").read_text()
+    assert (
+        "# Fit it:              ddco-pyro fit 'a b.yaml' --out runs/first\n" in Path("a b.yaml").read_text()
+    )
     done("check", "a b.yaml")

@@ -42,7 +42,9 @@ def demonstrations(number: int = 8) -> Demonstrations:
             "pose": random.normal(size=(steps, 3)),
             "camera": random.integers(0, 256, (steps, HEIGHT, WIDTH, 3), dtype=np.uint8),
         }
-        return Demonstration(f"demo_{index}", seen, random.normal(size=(steps, 2)), {"phase": np.arange(steps) // 4})
+        return Demonstration(
+            f"demo_{index}", seen, random.normal(size=(steps, 2)), {"phase": np.arange(steps) // 4}
+        )
 
     return Demonstrations(tuple(one(index) for index in range(number)))
 
@@ -70,7 +72,7 @@ def bits(fit: ddco_pyro.Fit) -> bytes:
     return b"".join(value.numpy().tobytes() for model in models for value in model.state_dict().values())
 
 
-# --- the file ---------------------------------------------------------------------------------------------------------
+# --- the file -----------------------------------------------------------------------------------------------
 
 
 def test_pictures_of_a_file_are_read_when_asked_for(kept: Path) -> None:
@@ -98,7 +100,7 @@ def test_a_file_that_has_changed_since(tmp_path: Path) -> None:
         pictures[:]
 
 
-# --- what networks see ------------------------------------------------------------------------------------------------
+# --- what networks see --------------------------------------------------------------------------------------
 
 
 def test_transform_by_hand() -> None:
@@ -114,7 +116,9 @@ def test_transform_by_hand() -> None:
 def test_pictures_are_cut_and_scaled_wherever_they_are(kept: Path) -> None:
     encoder = ObservationEncoder([ObservationSpec(**RAW)], {"camera": (HEIGHT, WIDTH, 3)})
     assert encoder.images == {"camera": (5, 4, 3)}
-    read, made = ([demo.observations for demo in demos] for demos in (Demonstrations.read(kept), demonstrations()))
+    read, made = (
+        [demo.observations for demo in demos] for demos in (Demonstrations.read(kept), demonstrations())
+    )
     seen, expected = (encoder.inputs(each).loaded().images["camera"] for each in (read, made))
     assert torch.equal(seen, expected)
     first = made[0]["camera"][0, 1:11, 2:10]
@@ -140,7 +144,9 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     encoder = ObservationEncoder(spec.observations, demonstrations().observation_shapes)
     demos = demonstrations()
     whole = Batch(
-        encoder.inputs(demo.observations for demo in demos), torch.zeros(8, 40, 2), torch.tensor(demos.lengths)
+        encoder.inputs(demo.observations for demo in demos),
+        torch.zeros(8, 40, 2),
+        torch.tensor(demos.lengths),
     )
     for seed in (1, 2):
         seen = whole.varied(encoder.shifts, seed)
@@ -159,7 +165,10 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        ({"key": "camera", "crop": [3, 3, 10, 4]}, r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"),
+        (
+            {"key": "camera", "crop": [3, 3, 10, 4]},
+            r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels",
+        ),
         ({"key": "pose", "resize": [4, 4]}, r"'pose' has shape \[3\] at each step: crop and resize are for"),
         ({"key": "pose", "shift": 1}, r"'pose' has shape \[3\] at each step: shift is f"),
         ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins are for vectors"),
@@ -173,7 +182,7 @@ def test_what_cannot_be_cut_is_refused(kept: Path, observation: dict[str, Any], 
         ddco_pyro.fit(parse_spec(data))
 
 
-# --- a fit ------------------------------------------------------------------------------------------------------------
+# --- a fit --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("chunks", [False, True])
@@ -222,12 +231,15 @@ def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:
     assert f"ddco-pyro: {path}: demo_2: obs/camera cannot be read" in ended.err.splitlines()[-1]
 
 
-# --- a policy is learnt from pictures ---------------------------------------------------------------------------------
+# --- a policy is learnt from pictures -----------------------------------------------------------------------
 
 
 CONVOLUTION = {
     "network": "conv",
-    "layers": [{"filters": 4, "kernel": 5, "stride": 2, "padding": 2}, {"filters": 4, "kernel": 3, "padding": 1}],
+    "layers": [
+        {"filters": 4, "kernel": 5, "stride": 2, "padding": 2},
+        {"filters": 4, "kernel": 3, "padding": 1},
+    ],
     "pool": "spatial_softmax",
     "hidden": [16],
 }

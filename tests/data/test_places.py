@@ -30,10 +30,14 @@ def fails_on_a_full_disk(size: int, *command: object) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert ended.status == 1, ended.err
-    assert "there is no room to write it; free some space, then do the same again" in ended.err.splitlines()[-1]
+    assert (
+        "there is no room to write it; free some space, then do the same again" in ended.err.splitlines()[-1]
+    )
 
 
-@pytest.mark.parametrize("size", [5000, *(pytest.param(size, marks=pytest.mark.slow) for size in (0, 60_000))])
+@pytest.mark.parametrize(
+    "size", [5000, *(pytest.param(size, marks=pytest.mark.slow) for size in (0, 60_000))]
+)
 def test_a_full_disk_while_importing(tmp_path: Path, size: int) -> None:
     source, out = tmp_path / "source.hdf5", tmp_path / "out.hdf5"
     demonstrations(20).write(source)
@@ -62,7 +66,9 @@ def test_a_full_disk_while_fitting(tmp_path: Path, cache) -> None:
     fails_on_a_full_disk(4000, "fit", spec, "--out", tmp_path / "run", *short)
     done("fit", spec, "--out", tmp_path / "run", *short)
     done("fit", spec, "--out", tmp_path / "other", *short)
-    assert (tmp_path / "run/model.safetensors").read_bytes() == (tmp_path / "other/model.safetensors").read_bytes()
+    assert (tmp_path / "run/model.safetensors").read_bytes() == (
+        tmp_path / "other/model.safetensors"
+    ).read_bytes()
 
 
 def test_a_read_only_folder(tmp_path: Path) -> None:
@@ -70,7 +76,9 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
     folder.mkdir()
     folder.chmod(0o555)
     ours = [
-        one for one in (tmp_path, *tmp_path.parents) if one.is_relative_to(gettempdir()) and one != Path(gettempdir())
+        one
+        for one in (tmp_path, *tmp_path.parents)
+        if one.is_relative_to(gettempdir()) and one != Path(gettempdir())
     ]
     for above in ours:
         above.chmod(above.stat().st_mode | 0o055)
@@ -79,7 +87,10 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
         if os.getuid() == 0:
             os.setuid(65534)  # nobody
         said = []
-        for attempt in (lambda: write_text(folder / "file", "x"), lambda: only_one(folder / "run").__enter__()):
+        for attempt in (
+            lambda: write_text(folder / "file", "x"),
+            lambda: only_one(folder / "run").__enter__(),
+        ):
             with pytest.raises(BadInput) as refused:
                 attempt()
             said.append(str(refused.value))
@@ -134,7 +145,7 @@ def test_what_the_dead_have_left_is_removed(tmp_path: Path) -> None:
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
 
 
-# --- files appear whole or not at all ---------------------------------------------------------------------------------
+# --- files appear whole or not at all -----------------------------------------------------------------------
 
 
 def test_a_write_that_is_cut_off_leaves_what_was_there(tmp_path):

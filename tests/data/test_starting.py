@@ -49,7 +49,11 @@ def two_skills(path: Path, number: int = 12) -> None:
         skill = np.repeat([5, 2, 5], [4, 5, 4])
         side = np.where(skill == 5, 1.0, -1.0)[:, None]
         place = random.normal(size=(13, 1))
-        seen = {"side": side + 0.1 * random.normal(size=(13, 1)), "place": place, "goal": np.full((13, 2), 3.0)}
+        seen = {
+            "side": side + 0.1 * random.normal(size=(13, 1)),
+            "place": place,
+            "goal": np.full((13, 2), 3.0),
+        }
         actions = side * place + NOISE * random.normal(size=(13, 1))
         records.append((seen, actions, {"skill": skill}))
     numbered(records).write(path)
@@ -58,15 +62,19 @@ def two_skills(path: Path, number: int = 12) -> None:
 def short_of_the_truth(fit: ddco_pyro.Fit) -> float:
     """Held-out nats per step that a fit to :func:`two_skills` lacks, beside the policy that they were drawn from."""
     held_out = fit.demonstrations.select([one.name for one in fit.metrics.valid])
-    side = [np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out]
-    truth = stats.norm.logpdf(np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE).mean()
+    side = [
+        np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out
+    ]
+    truth = stats.norm.logpdf(
+        np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE
+    ).mean()
     return float(truth - fit.metrics.log_likelihood_per_step.valid)
 
 
 @pytest.mark.slow
 def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Path) -> None:
-    """Segments are the planted ones. By Adam they are as likely, held out and to 0.1 nats per step, as under the policy
-    that they were drawn from.
+    """Segments are the planted ones. By Adam they are as likely, held out and to 0.1 nats per step, as under
+    the policy that they were drawn from.
     """
     two_skills(path)
     spec = tmp_path / "spec.yaml"
@@ -75,7 +83,10 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     assert re.fullmatch(r"median segment [\d.]+ steps in small fits", said[1])
     assert said[2:] == [f"{spec}: fit it with: ddco-pyro fit {spec} --out runs/spec"]
     ended = done("fit", spec, "--out", tmp_path / "run")
-    assert ended.out.splitlines()[-1] == f"next: ddco-pyro segment {tmp_path / 'run'} '{path}' --html segments.html"
+    assert (
+        ended.out.splitlines()[-1]
+        == f"next: ddco-pyro segment {tmp_path / 'run'} '{path}' --html segments.html"
+    )
     looked = call("inspect", path).out.splitlines()[-1]
     assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1.yaml'"
     fit = ddco_pyro.load(tmp_path / "run")
@@ -137,7 +148,9 @@ def test_options_are_compared_with_the_labels_that_know_most(path: Path) -> None
     assert "      count: 2                      # as many as the values of labels/whole; try others:" in text
     few = sum(list(facts.lengths.values())[:2])
     known = {"other": steps, "phase": few, "all": steps, "option": steps, "option_boundary": steps}
-    assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [(key, str(known[key])) for key in known]
+    assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [
+        (key, str(known[key])) for key in known
+    ]
 
 
 def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) -> None:
@@ -163,7 +176,9 @@ def test_of_many_broken_demonstrations_the_key_is_left_out(path: Path) -> None:
     assert "# - pose   # has 2 NaN and 0 infinite values" in text
     assert "- {key: camera}" in text
     assert "exclude" not in broken(path, 10, ["demo_2"], valid=("demo_2",))  # nothing would be held out
-    with pytest.raises(DemonstrationsError, match="actions has 1 NaN and 0 infinite values; repair them first"):
+    with pytest.raises(
+        DemonstrationsError, match="actions has 1 NaN and 0 infinite values; repair them first"
+    ):
         broken(path, 4, ["demo_1"], "actions")  # a quarter
 
 
@@ -171,7 +186,9 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     """Two cameras, a small one as it is and a larger one reduced; what is written can be fitted."""
     random, records = np.random.default_rng(2), []
     for _ in range(6):
-        seen = {name: random.integers(0, 256, (5, *size, 3), dtype=np.uint8) for name, size in CAMERAS.items()}
+        seen = {
+            name: random.integers(0, 256, (5, *size, 3), dtype=np.uint8) for name, size in CAMERAS.items()
+        }
         records.append((seen, random.normal(size=(5, 2))))
     numbered(records).write(tmp_path / "seen.hdf5")
     written = started(tmp_path / "seen.hdf5")
@@ -203,7 +220,8 @@ def turning(path: Path) -> None:
         angle = np.linspace(0, 7, 50) + random.uniform(-3, 3) + 0.02 * random.normal(size=50)
         real, other = np.cos(angle / 2), np.sin(angle / 2)
         quaternion = (
-            np.column_stack([other, 0 * real, 0 * real, real]) * np.sign(real if number % 2 else other)[:, None]
+            np.column_stack([other, 0 * real, 0 * real, real])
+            * np.sign(real if number % 2 else other)[:, None]
         )
         place = np.cumsum(random.normal(size=(50, 3)), axis=0)
         seen = {
@@ -227,8 +245,12 @@ def test_what_jumps_as_an_angle_or_a_quaternion_is_read_without_its_jumps(path: 
         "obs/pose: dimensions 3-6 change sign",
         "obs/yaw: dimension 1 jumps by 2π",
     ]
-    spec = load_spec(write(tmp_path, starting_spec(inspect(path), path).text), ["training.epochs=2", "compare_with=[]"])
-    read = {one.key: (one.angles, one.quaternions) for one in spec.observations if one.angles or one.quaternions}
+    spec = load_spec(
+        write(tmp_path, starting_spec(inspect(path), path).text), ["training.epochs=2", "compare_with=[]"]
+    )
+    read = {
+        one.key: (one.angles, one.quaternions) for one in spec.observations if one.angles or one.quaternions
+    }
     assert read == {"pose": ((), (3,)), "yaw": ((1,), ())}
     encoder = ddco_pyro.fit(spec).hierarchy.encoder
     for demo in Demonstrations.read(path):
@@ -258,7 +280,9 @@ def test_text_alone_cannot_be_fitted(path: Path) -> None:
         for group in file["data"].values():
             del group["obs/pose"], group["obs/camera"]
             group["obs/text"] = [b"a"] * len(group["actions"])
-    with pytest.raises(DemonstrationsError, match=r"no observation can be used: obs/text holds text, not numbers; see"):
+    with pytest.raises(
+        DemonstrationsError, match=r"no observation can be used: obs/text holds text, not numbers; see"
+    ):
         starting_spec(inspect(path), path)
 
 
@@ -290,11 +314,16 @@ def test_few_demonstrations_all_train(path: Path, tmp_path: Path) -> None:
     [({"one": 1}, 4), ({"many": 31}, 4), ({"coarse": 2, "fine": 6, "one": 1}, 6)],
 )
 @pytest.mark.usefixtures("undecided")
-def test_there_are_as_many_options_as_labels(labels: dict[str, int], count: int, path: Path, tmp_path: Path) -> None:
+def test_there_are_as_many_options_as_labels(
+    labels: dict[str, int], count: int, path: Path, tmp_path: Path
+) -> None:
     """Of the labelling that knows most; ``coarse`` knows no label in the first step."""
     records = []
     for number in range(9):
-        seen, actions = {"pose": np.random.default_rng(number).normal(size=(40, 2))}, np.arange(40.0)[:, None] % 5
+        seen, actions = (
+            {"pose": np.random.default_rng(number).normal(size=(40, 2))},
+            np.arange(40.0)[:, None] % 5,
+        )
         given = {name: (np.arange(40) * most // 40) - 10 * (name == "fine") for name, most in labels.items()}
         if "coarse" in given:
             given["coarse"][0] = -1
@@ -302,7 +331,9 @@ def test_there_are_as_many_options_as_labels(labels: dict[str, int], count: int,
     numbered(records).write(path)
     ended = call("init", path, "--out", tmp_path / "spec.yaml")
     assert load_spec(tmp_path / "spec.yaml").hierarchy.levels[0].count == count
-    said = [f"{count} options, as many as the values of labels/{name}" for name in labels if labels[name] == count]
+    said = [
+        f"{count} options, as many as the values of labels/{name}" for name in labels if labels[name] == count
+    ]
     assert ended.out.splitlines()[:-1] == said
 
 
@@ -324,7 +355,14 @@ def of_operators(path: Path, operators: str) -> Path:
 def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: Path, tmp_path: Path) -> None:
     """About a fifth is held out, the same in every call, and a fit has this division."""
     ended = [
-        call("init", of_operators(path, operators), "--out", tmp_path / f"{n}.yaml", "--hold-out-by", "operator")
+        call(
+            "init",
+            of_operators(path, operators),
+            "--out",
+            tmp_path / f"{n}.yaml",
+            "--hold-out-by",
+            "operator",
+        )
         for n in "01"
     ]
     first, again = ((tmp_path / f"{n}.yaml").read_text() for n in "01")
@@ -334,7 +372,9 @@ def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: 
     )
     spec = load_spec(tmp_path / "0.yaml")
     for demos in (read_demonstrations(spec), outline(spec), seen(spec, Demonstrations.read(path))):
-        train, valid = ([one.attributes["operator"] for one in part] for part in train_and_valid(spec, demos).values())
+        train, valid = (
+            [one.attributes["operator"] for one in part] for part in train_and_valid(spec, demos).values()
+        )
         assert {*train} | {*valid} == {*operators}
         assert not {*train} & {*valid}
         assert (", ".join(sorted({*valid})), str(len(valid))) == said.groups()
@@ -346,7 +386,10 @@ def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: 
 @pytest.mark.parametrize(
     ("attribute", "says"),
     [
-        ("operater", "demo_0 has no attribute 'operater' (did you mean 'operator'?); there is: operator, robot"),
+        (
+            "operater",
+            "demo_0 has no attribute 'operater' (did you mean 'operator'?); there is: operator, robot",
+        ),
         ("robot", "attribute 'robot' is left in all demonstrations; hold out by another one"),
     ],
 )
@@ -390,7 +433,9 @@ def test_what_init_accepts_check_accepts(name: str, tmp_path: Path) -> None:
         with pytest.raises(DemonstrationsError, match=says):
             starting_spec(found, path)
         said = "\n".join([*found.problems, *found.notes])
-        assert re.search(says, said) or found.problems or found.leaks or all(d.constant for d in found.control)
+        assert (
+            re.search(says, said) or found.problems or found.leaks or all(d.constant for d in found.control)
+        )
     elif name in FITTED:
         run = spec.with_suffix(".run")
         done("fit", spec, "--out", run, "--jobs", 1, *with_set("training.epochs=2", "compare_with=[]"))

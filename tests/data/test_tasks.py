@@ -35,7 +35,8 @@ STATE, NOISE = 0.2, 0.05
 def four_tasks(number: int = 10, seed: int = 0) -> Demonstrations:
     """Four planted tasks with three options of their own each: in each, phases are numbers from 0 to 2.
 
-    Each option has a place of its own on a circle, and the control is the way there from a state that wanders.
+    Each option has a place of its own on a circle, and the control is the way there from a state that
+    wanders.
 
     A demonstration has three segments of 6 to 9 steps, one of each option of its task.
     """
@@ -48,7 +49,9 @@ def four_tasks(number: int = 10, seed: int = 0) -> Demonstrations:
             states = random.normal(0, STATE, (len(phases), 2))
             controls = places[task + len(TASKS) * phases] - states + random.normal(0, NOISE, states.shape)
             about = {"task": name}
-            demos.append(Demonstration(f"demo_{len(demos)}", {"state": states}, controls, {"phase": phases}, about))
+            demos.append(
+                Demonstration(f"demo_{len(demos)}", {"state": states}, controls, {"phase": phases}, about)
+            )
     return Demonstrations(tuple(demos))
 
 
@@ -71,7 +74,7 @@ def run(spec: Spec, path: Path) -> ddco_pyro.Fit:
     return ddco_pyro.fit(spec, out=path.with_name("run"), jobs=1)
 
 
-# --- read, listed, asked for ------------------------------------------------------------------------------------------
+# --- read, listed, asked for --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -95,7 +98,9 @@ def test_inspect_lists_tasks_with_what_only_some_have(path: Path, tmp_path: Path
             if group.attrs["task"] != "push":
                 group["obs/lid"] = np.zeros((len(group["actions"]), 1))
     rows = [line.split("│") for line in call("inspect", tmp_path / "four.hdf5").out.splitlines()]
-    lengths = {task: [len(demo) for demo in four_tasks(3) if demo.attributes["task"] == task] for task in TASKS}
+    lengths = {
+        task: [len(demo) for demo in four_tasks(3) if demo.attributes["task"] == task] for task in TASKS
+    }
     for task, steps in lengths.items():
         (row,) = [[cell.strip() for cell in row] for row in rows if row[0].strip() == task]
         span = f"{min(steps)} to {max(steps)}"
@@ -127,7 +132,10 @@ def test_where_asks_for_tasks(path: Path, run: ddco_pyro.Fit, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("where", "says"),
     [
-        ("task=opem", "no demonstration has task=opem (did you mean 'open'?); there is: close, open, press, push"),
+        (
+            "task=opem",
+            "no demonstration has task=opem (did you mean 'open'?); there is: close, open, press, push",
+        ),
         ("operator=A", "demo_0 has no attribute 'operator'; there is: task"),
         ("task", "--where task: write ATTRIBUTE=VALUE, such as task=reach"),
     ],
@@ -137,7 +145,7 @@ def test_what_is_not_there_is_one_line(where: str, says: str, path: Path, tmp_pa
         refused(says, *command, "--where", where)
 
 
-# --- division ---------------------------------------------------------------------------------------------------------
+# --- division -----------------------------------------------------------------------------------------------
 
 
 def test_demonstrations_are_drawn_within_tasks(spec: Spec) -> None:
@@ -155,7 +163,7 @@ def test_instructions_of_one_demonstration_each_are_drawn_together() -> None:
     assert [one.name for one in valid] == [one.name for one in demonstrations(10).split(0.3, 0)[1]]
 
 
-# --- pooled -----------------------------------------------------------------------------------------------------------
+# --- pooled -------------------------------------------------------------------------------------------------
 
 
 def test_a_damaged_one_of_several_files_is_named(tmp_path: Path) -> None:
@@ -173,7 +181,9 @@ def test_files_are_pooled_with_the_keys_that_all_have(tmp_path: Path) -> None:
     for name, size in (("open", 4), ("push", 7)):
         seen = {key: np.ones((5, width)) for key, width in {"pose": 2, f"of_{name}": 1, "size": size}.items()}
         labels = {"phase": [0, 0, 1, 1, 2], name: [1] * 5}
-        numbered((seen, random.normal(size=(5, 2)), labels) for _ in range(2)).write(tmp_path / f"{name}.hdf5")
+        numbered((seen, random.normal(size=(5, 2)), labels) for _ in range(2)).write(
+            tmp_path / f"{name}.hdf5"
+        )
     with h5py.File(tmp_path / "push.hdf5", "r+") as file:
         file.attrs["label_names"] = json.dumps({"phase": ["near", "touch", "shove"]})
     ended = done("import", tmp_path / "open.hdf5", tmp_path / "push.hdf5", "--out", tmp_path / "pooled.hdf5")
@@ -188,7 +198,9 @@ def test_files_are_pooled_with_the_keys_that_all_have(tmp_path: Path) -> None:
     assert [*pooled.observation_shapes] == ["pose"]
     names = label_names(pooled.attributes)
     said = {
-        (key, demo.attributes["task"]): [names[key][value] if value >= 0 else None for value in demo.labels[key]]
+        (key, demo.attributes["task"]): [
+            names[key][value] if value >= 0 else None for value in demo.labels[key]
+        ]
         for demo in pooled
         for key in ("phase", "open")
     }
@@ -201,7 +213,7 @@ def test_files_are_pooled_with_the_keys_that_all_have(tmp_path: Path) -> None:
     refused("another file is called push, too; rename one", "import", *both, "--out", tmp_path / "x.hdf5")
 
 
-# --- planted tasks ----------------------------------------------------------------------------------------------------
+# --- planted tasks ------------------------------------------------------------------------------------------
 
 
 def test_init_shows_the_task_to_gates_alone(spec: Spec) -> None:
@@ -209,7 +221,11 @@ def test_init_shows_the_task_to_gates_alone(spec: Spec) -> None:
     (level,) = spec.hierarchy.levels
     assert level.count == OPTIONS * len(TASKS)
     assert [one.key for one in spec.observations] == ["state", "task"]
-    assert (level.policy.inputs, level.termination.inputs, spec.hierarchy.meta_policy.inputs) == (("state",), (), ())
+    assert (level.policy.inputs, level.termination.inputs, spec.hierarchy.meta_policy.inputs) == (
+        ("state",),
+        (),
+        (),
+    )
 
 
 def test_planted_options_agree_within_each_task(run: ddco_pyro.Fit, path: Path, tmp_path: Path) -> None:
@@ -231,7 +247,8 @@ def test_agreement_is_the_mean_over_tasks() -> None:
     truth = [np.array([0, 0, 1, 1]), np.array([0, 0, 1, 1]), np.array([0, 0, 1, 1]), np.array([0, 1, 1, 1])]
     tasks = ["a", "a", "b", "b"]
     nmi = [
-        normalized_mutual_info_score(np.concatenate(truth[n : n + 2]), np.concatenate(ours[n : n + 2])) for n in (0, 2)
+        normalized_mutual_info_score(np.concatenate(truth[n : n + 2]), np.concatenate(ours[n : n + 2]))
+        for n in (0, 2)
     ]
     assert agreement(ours, truth, tasks).nmi == pytest.approx(np.mean(nmi))
     assert agreement(ours, truth).nmi < 0.1
@@ -246,7 +263,9 @@ def test_a_controller_takes_the_name_of_the_task(run: ddco_pyro.Fit) -> None:
         controller.reset(0)
         first[task] = controller.act({"state": state, "task": task})
         controller.reset(0)
-        numbers = np.eye(len(TASKS))[TASKS.index(task)] if task in TASKS else np.full(len(TASKS), 1 / len(TASKS))
+        numbers = (
+            np.eye(len(TASKS))[TASKS.index(task)] if task in TASKS else np.full(len(TASKS), 1 / len(TASKS))
+        )
         np.testing.assert_array_equal(controller.act({"state": state, "task": numbers}), first[task])
     assert len({tuple(first[task]) for task in TASKS}) > 1
 
@@ -255,7 +274,9 @@ def test_an_observation_relative_to_another_is_their_difference(tmp_path: Path) 
     random, records = np.random.default_rng(0), []
     for _ in range(6):
         cup, hand = random.normal(size=(2, 20, 3))
-        records.append(({"cup_pos": cup, "hand_pos": hand}, 0.5 * (cup - hand) + 0.1 * random.normal(size=(20, 3))))
+        records.append(
+            ({"cup_pos": cup, "hand_pos": hand}, 0.5 * (cup - hand) + 0.1 * random.normal(size=(20, 3)))
+        )
     demos = numbered(records)
     demos.write(tmp_path / "demos.hdf5")
     text = call("inspect", tmp_path / "demos.hdf5").out

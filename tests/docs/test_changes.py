@@ -105,7 +105,9 @@ SPEC = {
     "observations": ["place"],
     "control": {"kind": "laplace", "std": 0.5},
     "hierarchy": {
-        "levels": [{"count": 2, "policy": {"network": "squared:Squared"}, "termination": {"network": "linear"}}],
+        "levels": [
+            {"count": 2, "policy": {"network": "squared:Squared"}, "termination": {"network": "linear"}}
+        ],
         "meta_policy": {"network": "linear"},
     },
     "training": {"epochs": 2, "optimizer": {"name": "adam"}},
@@ -153,7 +155,9 @@ def test_a_distribution_a_network_and_formats_are_a_file_and_a_row_each(changed)
     np.savez(changed / "mine.npz", place=place, actions=2 * place + random.laplace(size=place.shape))
     (changed / "spec.yaml").write_text(yaml.safe_dump(SPEC))
     environment = {**os.environ, "PYTHONPATH": str(changed)}
-    done = subprocess.run([sys.executable, "-c", ALL], cwd=changed, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", ALL], cwd=changed, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.split()[-1]) == pytest.approx(stats.laplace(1, 0.5).logpdf([0, 3]).sum())
     steps = pd.read_csv(changed / "steps.csv")

@@ -90,7 +90,10 @@ def literal_f1(segments, labels, overlap):
     right, wrong, missed = 0, 0, 0
     for ours, theirs in zip(segments, labels, strict=True):
         a, b = (
-            [(key, {step for step, _ in run}) for key, run in groupby(enumerate(one), key=lambda pair: pair[1])]
+            [
+                (key, {step for step, _ in run})
+                for key, run in groupby(enumerate(one), key=lambda pair: pair[1])
+            ]
             for one in (ours, theirs)
         )
         free = set(range(len(b)))
@@ -152,7 +155,9 @@ def test_the_table_says_where_each_label_went():
 
 
 demonstrations = st.lists(
-    st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2)), min_size=1, max_size=12), min_size=1, max_size=4
+    st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2)), min_size=1, max_size=12),
+    min_size=1,
+    max_size=4,
 )
 
 
@@ -164,8 +169,13 @@ def sides(pairs):
 @given(demonstrations, st.permutations(range(4)), st.permutations(range(3)))
 def test_names_do_not_matter(pairs, options, labels):
     segments, truth = sides(pairs)
-    options, labels = np.array(options) * 3 - 4, np.array([*labels, UNKNOWN - 5]) + 5  # -1, not known, stays what it is
-    renamed = agreement([options[h] for h in segments], [np.where(one < 0, one, labels[one]) for one in truth])
+    options, labels = (
+        np.array(options) * 3 - 4,
+        np.array([*labels, UNKNOWN - 5]) + 5,
+    )  # -1, not known, stays what it is
+    renamed = agreement(
+        [options[h] for h in segments], [np.where(one < 0, one, labels[one]) for one in truth]
+    )
     found = agreement(segments, truth)
     if found is None:
         assert renamed is None
@@ -227,7 +237,9 @@ def test_two_annotators(tmp_path):
     a = annotated(tmp_path / "a.hdf5", first, list("rgp"))
     b = annotated(tmp_path / "b.hdf5", second, list("pgr"))
     found = compare_annotators(a, b, 1)["skill"]
-    both = [(x, y) for demo in "ab" for x, y in zip(first[demo], second[demo], strict=True) if "." not in (x, y)]
+    both = [
+        (x, y) for demo in "ab" for x, y in zip(first[demo], second[demo], strict=True) if "." not in (x, y)
+    ]
     assert (found.demonstrations, found.steps, found.both) == (2, 16, len(both))
     assert found.same == sum(x == y for x, y in both) == 9
     assert found.kappa == pytest.approx(cohen_kappa_score(*zip(*both, strict=True)))
@@ -245,7 +257,10 @@ def test_two_annotators(tmp_path):
 
 def test_annotators_of_other_demonstrations_are_refused(tmp_path):
     a = annotated(tmp_path / "a.hdf5", {"a": "rrr"}, ["r"])
-    for labels, why in (({"b": "rrr"}, "has none of the demonstrations of"), ({"a": "rr"}, "a has 2 steps, and 3 in")):
+    for labels, why in (
+        ({"b": "rrr"}, "has none of the demonstrations of"),
+        ({"a": "rr"}, "a has 2 steps, and 3 in"),
+    ):
         with pytest.raises(BadInput, match=why):
             compare_annotators(a, annotated(tmp_path / "b.hdf5", labels, ["r"]), 1)
     for missing in ((a, tmp_path / "no.hdf5"), (tmp_path / "no.hdf5", a)):

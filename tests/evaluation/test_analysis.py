@@ -37,7 +37,9 @@ def test_use_of_options_by_sums_over_every_path():
         assert one.choice == choice
         assert one.share == pytest.approx(u[choice] / 7)
         assert one.selected == pytest.approx(v[choice])
-        assert one.demonstrations == pytest.approx(sum(min(1.0, truth.v[0].sum(0)[choice]) for truth in truths))
+        assert one.demonstrations == pytest.approx(
+            sum(min(1.0, truth.v[0].sum(0)[choice]) for truth in truths)
+        )
         assert one.duration == pytest.approx(u[choice] / v[choice])
     assert found[0].duration == pytest.approx(1)  # control lasts one step
     assert [(one.segments, one.steps, one.length) for one in found] == [(1, 2, 2), (2, 3, 1.5), (2, 2, 1)]
@@ -54,7 +56,12 @@ def use(*demonstrations, size=0):
             active[row, start : start + length, option] = 1
             selected[row, start, option] = 1
             start += length
-    paths = [[np.concatenate([np.full(length, option) for option, length in segments]) for segments in demonstrations]]
+    paths = [
+        [
+            np.concatenate([np.full(length, option) for option, length in segments])
+            for segments in demonstrations
+        ]
+    ]
     return option_use(Posterior((active,), (selected,), (active,)), paths)
 
 
@@ -105,7 +112,9 @@ def test_divergences_of_policies_that_emit_one_kind_of_thing(hybrid):
     apart = (decision.emission.mean[:, :, 0] - decision.emission.mean[:, :, 1]) / decision.emission.std
     weight = u[..., 1] + u[..., 2]
     (found,) = divergences([(Outputs((CallerOutputs(0, None, decision.emission), decision), ()), same)])
-    assert found[0].divergence == pytest.approx(float((weight * apart.square().sum(-1) / 2).sum() / weight.sum()))
+    assert found[0].divergence == pytest.approx(
+        float((weight * apart.square().sum(-1) / 2).sum() / weight.sum())
+    )
     options = decision.logits[..., 1:]
     (found,) = divergences([(Outputs((CallerOutputs(2, options, None), decision), ()), same)])
     p, q = (options[:, :, i].log_softmax(-1) for i in (0, 1))
@@ -135,7 +144,7 @@ def test_its_error_covers_the_truth_as_often_as_it_says():
     assert abs(means.mean() - 0.5) < 4 * means.std() / math.sqrt(400)
 
 
-# --- the parts of a log-likelihood ------------------------------------------------------------------------------------
+# --- the parts of a log-likelihood --------------------------------------------------------------------------
 
 
 LENGTHS = (3, 2)
@@ -143,7 +152,8 @@ LENGTHS = (3, 2)
 
 RANDOM = np.random.default_rng(0)
 DEMOS = numbered(
-    ({"pose": RANDOM.normal(size=(steps, 2))}, RANDOM.normal([5, 0.5, 0], [3, 0, 0.1], (steps, 3))) for steps in LENGTHS
+    ({"pose": RANDOM.normal(size=(steps, 2))}, RANDOM.normal([5, 0.5, 0], [3, 0, 0.1], (steps, 3)))
+    for steps in LENGTHS
 )
 """Of three control dimensions, the second of them constant."""
 
@@ -151,7 +161,9 @@ DEMOS = numbered(
 def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
     """Random networks that differ between options; σ of each level is its own."""
     above = LINEAR | {"emits": list(emits)}
-    levels = [{"name": f"level-{d}", "count": k, "policy": above if d else LINEAR} for d, k in enumerate(counts)]
+    levels = [
+        {"name": f"level-{d}", "count": k, "policy": above if d else LINEAR} for d, k in enumerate(counts)
+    ]
     options = {"hierarchy": {"levels": levels, "meta_policy": above}} if counts else {}
     spec = small_spec(counts, observations=["pose"], control={"std": {"learn": True}}, **options)
     torch.manual_seed(1)
@@ -166,7 +178,12 @@ def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
 
 @pytest.mark.parametrize(
     ("counts", "emits"),
-    [((), ("control",)), ((3,), ("options",)), ((2,), ("options", "control")), ((2, 2), ("options", "control"))],
+    [
+        ((), ("control",)),
+        ((3,), ("options",)),
+        ((2,), ("options", "control")),
+        ((2, 2), ("options", "control")),
+    ],
     ids=["flat", "options", "hybrid", "two hybrid levels"],
 )
 def test_parts_are_those_of_every_path_so_far(counts: tuple[int, ...], emits: tuple[str, ...]) -> None:
@@ -196,7 +213,9 @@ def _actor(choices: tuple[int, ...]) -> tuple[int, int]:
     return next(((level, choice - 1) for level, choice in enumerate(choices) if choice), (len(choices), 0))
 
 
-def _densities(hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int) -> dict[tuple[int, int], np.ndarray]:
+def _densities(
+    hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int
+) -> dict[tuple[int, int], np.ndarray]:
     """log N(a_td; μ_d, σ_d²) of each caller, [T, A'], with scipy and in the control's own units."""
     shift, scale = hierarchy.scaling.shift.numpy(), hierarchy.scaling.scale.numpy()
 
@@ -214,7 +233,7 @@ def _densities(hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int) -> 
     }
 
 
-# --- signs of a degenerate solution -----------------------------------------------------------------------------------
+# --- signs of a degenerate solution -------------------------------------------------------------------------
 
 
 def level(*shares, durations=None):
@@ -222,7 +241,13 @@ def level(*shares, durations=None):
     durations = durations or [5.0] * len(shares)
     return [
         Use.model_construct(
-            choice=choice, share=share, selected=20.0, demonstrations=2.0, duration=duration, having=2, within=None
+            choice=choice,
+            share=share,
+            selected=20.0,
+            demonstrations=2.0,
+            duration=duration,
+            having=2,
+            within=None,
         )
         for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
     ]
@@ -253,8 +278,12 @@ def lasting(duration):
         ([level(0.5, 0.25, 0.25, durations=[1.0, 5.0, 5.0])], []),
         ([level(0.51, 0.245, 0.245, durations=[1.0, 5.0, 5.0])], [Finding("high_fitting", 1, 0, 0.51)]),
         # an unused option is not also said to be short
-        ([level(0.0, 0.001, 0.4995, 0.4995, durations=[None, 1.0, 5.0, 5.0])], [Finding("unused", 1, 1, 0.001)]),
-        # the meta-policy does all the work of option 1, which ends at once and is selected again; option 2 lasts
+        (
+            [level(0.0, 0.001, 0.4995, 0.4995, durations=[None, 1.0, 5.0, 5.0])],
+            [Finding("unused", 1, 1, 0.001)],
+        ),
+        # the meta-policy does all the work of option 1, which ends at once and is selected again; option 2
+        # lasts
         (use(*[[(1, 1)] * 6 + [(2, 6)]] * 4), [short(1, 6.0)]),
         # the first reach of every demonstration, and a grasp: each is selected once and ends by design
         (use(*[[(1, 1), (2, 6), (3, 1), (2, 7)]] * 4), []),
@@ -289,7 +318,11 @@ def test_options_that_switch_all_the_time_are_a_sign(lengths, rate, brief):
     segments = segments_of([path, path], rate)
     least = 0.5 * rate if rate else max(5, len(path) / 50)
     twitches = sum(steps < least for steps in lengths)
-    assert (segments.median, segments.number, segments.twitches) == (np.median(lengths), 2 * len(lengths), 2 * twitches)
+    assert (segments.median, segments.number, segments.twitches) == (
+        np.median(lengths),
+        2 * len(lengths),
+        2 * twitches,
+    )
     found = [one for one in diagnose([level(0.0, 0.5, 0.5)], segments=[segments]) if one.kind == "brief"]
     assert found == (
         [Finding("brief", 1, 0, float(np.median(lengths)), times=twitches / len(lengths))] if brief else []
@@ -301,7 +334,9 @@ def test_an_option_of_most_steps_of_some_demonstrations_is_a_sign(demonstrations
     """Two thirds count where no more than half of the demonstrations have the option."""
     own = use([(1, 300), (2, 130)], [(2, 40)])[0]
     own[1] = own[1].model_copy(update={"having": 24})
-    signs = diagnose([own], segments=[Segments(median=100, number=200, demonstrations=demonstrations, twitches=0)])
+    signs = diagnose(
+        [own], segments=[Segments(median=100, number=200, demonstrations=demonstrations, twitches=0)]
+    )
     assert [one.kind for one in signs] == (["whole"] if found else [])
 
 
@@ -314,7 +349,9 @@ def test_an_option_of_most_steps_of_some_demonstrations_is_a_sign(demonstrations
         ({"starts": ["equal_parts"], "labels": {"level": "option", "from": "phase"}}, False),
     ],
 )
-def test_clusters_are_advised_where_neither_they_nor_labels_start(training: dict[str, Any], clusters: bool) -> None:
+def test_clusters_are_advised_where_neither_they_nor_labels_start(
+    training: dict[str, Any], clusters: bool
+) -> None:
     for kind in ("unused", "redundant", "dominating"):
         advice = Finding(kind, 1, 1, 0.0).advice(TrainingSpec.model_validate(training))
         assert ("clusters" in advice) == clusters

@@ -31,7 +31,7 @@ def console_says(metrics, capsys):
     return " ".join(capsys.readouterr().out.split())
 
 
-# --- fits that fell apart ---------------------------------------------------------------------------------------------
+# --- fits that fell apart -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -70,19 +70,29 @@ def test_a_baseline_that_fell_apart_comes_last_with_advice_for_itself(capsys):
     metrics = scored({"ddco": 2.0, "flat": 9.0}, {"ddco": around(1.0), "flat": around(0.5)}, -2.0, 2)
     assert verdicts.doubts(metrics) == []
     ((text, advice),) = verdicts.faults(metrics)
-    assert text.startswith("Flat fell apart on held-out demonstrations: 0.50 nats per step there, 9.00 in training.")
+    assert text.startswith(
+        "Flat fell apart on held-out demonstrations: 0.50 nats per step there, 9.00 in training."
+    )
     assert "this baseline" in advice
-    assert verdicts.verdict(metrics).index("Options explain") < verdicts.verdict(metrics).index("Flat fell apart")
+    assert verdicts.verdict(metrics).index("Options explain") < verdicts.verdict(metrics).index(
+        "Flat fell apart"
+    )
     assert text in console_says(metrics, capsys)
 
 
 def test_a_model_below_simpler_ones_is_doubtful():
     """It loses nothing on held-out demonstrations, yet a mean and a spread, or a flat policy, predict better."""
     text = verdicts.verdict(scored({"ddco": -3.0}, {"ddco": around(-3.0)}, -1.0, 2))
-    assert text.startswith("Options predict held-out controls worse than the mean and the spread of each control do: ")
-    text = verdicts.verdict(scored({"ddco": 1.1, "flat": 1.5}, {"ddco": around(1), "flat": around(1.4, 2)}, -2.0, 2))
+    assert text.startswith(
+        "Options predict held-out controls worse than the mean and the spread of each control do: "
+    )
+    text = verdicts.verdict(
+        scored({"ddco": 1.1, "flat": 1.5}, {"ddco": around(1), "flat": around(1.4, 2)}, -2.0, 2)
+    )
     error = np.std(TEN, ddof=1) / np.sqrt(10)
-    assert text.startswith(f"Options are below flat by 0.40 ± {error:.2f} nats per step on held-out demonstrations. T")
+    assert text.startswith(
+        f"Options are below flat by 0.40 ± {error:.2f} nats per step on held-out demonstrations. T"
+    )
 
 
 @pytest.mark.parametrize(("nats", "controls", "told"), [(0.02, 7, False), (0.02, 1, True), (0.08, 7, True)])
@@ -112,7 +122,10 @@ def test_the_density_without_observations_has_the_means_and_spreads_of_training(
     """A Gaussian control and a switch, beside scipy's densities with the moments of the training demonstrations."""
     random = np.random.default_rng(0)
     rows = [
-        ({"seen": random.normal(size=(30, 2))}, np.stack([random.normal(3, 2, 30), random.random(30) < 0.3], 1) * 1.0)
+        (
+            {"seen": random.normal(size=(30, 2))},
+            np.stack([random.normal(3, 2, 30), random.random(30) < 0.3], 1) * 1.0,
+        )
         for _ in range(12)
     ]
     spec = small_spec(
@@ -126,7 +139,8 @@ def test_the_density_without_observations_has_the_means_and_spreads_of_training(
     metrics = ddco_pyro.fit(spec, demos).metrics
     held_out = {row.name for row in metrics.valid}
     train, valid = (
-        np.concatenate([demo.actions for demo in demos if (demo.name in held_out) == part]) for part in (False, True)
+        np.concatenate([demo.actions for demo in demos if (demo.name in held_out) == part])
+        for part in (False, True)
     )
     values = stats.norm.logpdf(valid, train.mean(0), train.std(0))
     if kind == "auto":
@@ -135,13 +149,15 @@ def test_the_density_without_observations_has_the_means_and_spreads_of_training(
     assert metrics.marginal.controls == 2
 
 
-# --- the test against the mixture -------------------------------------------------------------------------------------
+# --- the test against the mixture ---------------------------------------------------------------------------
 
 
 def memory(mean, error, held_out=10, **more):
     """A run with a mixture beside it."""
     lead = {"nats_per_step": mean, "standard_error": error}
-    return made_metrics(held_out, worth={"memory": lead}, comparison={"mixture": compared(mean, error)}, **more)
+    return made_metrics(
+        held_out, worth={"memory": lead}, comparison={"mixture": compared(mean, error)}, **more
+    )
 
 
 SEEDS = {"training_seeds": [0, 1, 2], "held_out": {"ddco": [1.0, 1.1, 1.2]}}
@@ -180,9 +196,14 @@ def test_one_fit_says_what_was_measured(mean, error, way, lead, capsys):
 def test_one_or_two_held_out_demonstrations_say_nothing_of_significance(held_out, seeds):
     error = None if held_out == 1 else 0.001
     text = verdicts.verdict(memory(0.5, error, held_out, seeds=seeds))
-    assert f"Too few demonstrations ({held_out}) are held out to compare options that last with the mixture" in text
+    assert (
+        f"Too few demonstrations ({held_out}) are held out to compare options that last with the mixture"
+        in text
+    )
     assert not {"±", "["} & {*text}
-    assert not any(word in text for word in ("predict held-out controls better", "no clear difference", "significant"))
+    assert not any(
+        word in text for word in ("predict held-out controls better", "no clear difference", "significant")
+    )
 
 
 @pytest.mark.parametrize(
@@ -227,11 +248,36 @@ def test_very_short_options_are_not_said_to_last(brief, capsys):
 @pytest.mark.parametrize(
     ("only", "others", "seeds", "said"),
     [
-        (9, 1, None, "In this fit options succeed more often than the mixture: +8 (p = 0.021) of 50 episodes."),
-        (1, 9, None, "In this fit options succeed less often than the mixture: −8 (p = 0.021) of 50 episodes."),
-        (5, 4, None, "In this fit it is inconclusive whether options succeed more often than the mixture: +1 (p ="),
-        (20, 0, [0.4, 0.41, 0.42], "Over 3 training seeds options succeed more often than the mixture: +41 ["),
-        (5, 4, [0.02, 0.1, -0.1], "Over 3 training seeds it is inconclusive whether options succeed more often than"),
+        (
+            9,
+            1,
+            None,
+            "In this fit options succeed more often than the mixture: +8 (p = 0.021) of 50 episodes.",
+        ),
+        (
+            1,
+            9,
+            None,
+            "In this fit options succeed less often than the mixture: −8 (p = 0.021) of 50 episodes.",
+        ),
+        (
+            5,
+            4,
+            None,
+            "In this fit it is inconclusive whether options succeed more often than the mixture: +1 (p =",
+        ),
+        (
+            20,
+            0,
+            [0.4, 0.41, 0.42],
+            "Over 3 training seeds options succeed more often than the mixture: +41 [",
+        ),
+        (
+            5,
+            4,
+            [0.02, 0.1, -0.1],
+            "Over 3 training seeds it is inconclusive whether options succeed more often than",
+        ),
     ],
 )
 def test_success_is_told_where_it_was_measured(only, others, seeds, said):
@@ -257,14 +303,19 @@ def test_success_is_told_where_it_was_measured(only, others, seeds, said):
         (0.1, 0.05, 10, "with no clear difference from flat (+0.10 ± 0.05 nats per step)"),
         (0.1, 0.04, 100, "0.10 ± 0.04 nats per step better than flat"),
         (0.1, 0.04, 3, "with no clear difference from flat"),
-        (0.1, None, 1, "0.10 nats per step better than flat (1 held-out demonstration is too few for an error; one"),
+        (
+            0.1,
+            None,
+            1,
+            "0.10 nats per step better than flat (1 held-out demonstration is too few for an error; one",
+        ),
     ],
 )
 def test_a_lead_has_its_error(mean, error, held_out, said):
     assert said in verdicts.verdict(made_metrics(held_out, comparison={"flat": compared(mean, error)}))
 
 
-# --- labels -----------------------------------------------------------------------------------------------------------
+# --- labels -------------------------------------------------------------------------------------------------
 
 
 def test_equal_parts_that_agree_better_are_a_sign():
@@ -281,7 +332,9 @@ def test_equal_parts_that_agree_better_are_a_sign():
         return [said for said, _ in degeneracies(found, spec, {"skill": []})]
 
     (said,) = signs(train=0.9, equal_train=0.2, valid=0.41, equal_valid=0.52)
-    assert said.startswith("Equal parts of each demonstration agree better with labels “phase” than options do: NMI 0")
+    assert said.startswith(
+        "Equal parts of each demonstration agree better with labels “phase” than options do: NMI 0"
+    )
     assert said.endswith("held out.")
     (said,) = signs(train=0.41, equal_train=0.52)
     assert said.endswith("in training.")

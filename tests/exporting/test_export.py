@@ -127,13 +127,20 @@ FITS = {
     "flat": make("mlp", (), built_in=("step",)),
     "lstm": make(RECURRENT, (2, 2), BOTH, endings=RECURRENT, control="sample"),
     "lstm over pictures": make(
-        {"network": "lstm", "over": CONVOLUTIONS}, camera=True, endings=CONVOLUTIONS, steps=30, options="sample"
+        {"network": "lstm", "over": CONVOLUTIONS},
+        camera=True,
+        endings=CONVOLUTIONS,
+        steps=30,
+        options="sample",
     ),
     "trunk": make("mlp", (2, 3), BOTH, trunk=BRANCHES, options="sample", **SMALL),
     "branches": make(BRANCHES, (2, 3), BOTH, endings={"network": "linear", "inputs": ["state"]}, **SMALL),
     "pictures alone": make(LEAKY, camera=True, endings=LEAKY, vectors=False, options="sample"),
     "several convolutions": make(
-        CONVOLUTIONS, camera=True, endings={"network": "linear", "inputs": ["step", "goal"]}, built_in=("step",)
+        CONVOLUTIONS,
+        camera=True,
+        endings={"network": "linear", "inputs": ["step", "goal"]},
+        built_in=("step",),
     ),
 }
 
@@ -231,7 +238,10 @@ def test_each_form_runs_without_this_library(exported, form):
         ({"visited": np.zeros(1)}, r"the observation has no 'offsets' \(it has: visited\)"),
         ({"offsets": np.zeros(3), "visited": np.zeros(1)}, r"'offsets' has shape \(3,\), the demonst"),
         ({"offsets": np.full(4, np.nan), "visited": np.zeros(1)}, "'offsets' is not finite"),
-        ({"offsets": np.array(list("abcd")), "visited": np.zeros(1)}, "'offsets' is <U1, it has to be numbers"),
+        (
+            {"offsets": np.array(list("abcd")), "visited": np.zeros(1)},
+            "'offsets' is <U1, it has to be numbers",
+        ),
     ],
 )
 def test_both_refuse_the_same_observations(exported, toy_run, observation, message):
@@ -241,7 +251,7 @@ def test_both_refuse_the_same_observations(exported, toy_run, observation, messa
             controller.act(observation)
 
 
-# --- what acts otherwise ----------------------------------------------------------------------------------------------
+# --- what acts otherwise ------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -283,7 +293,9 @@ LONG = make("per_timestep", (), steps=30)
         pytest.param(MANY, "networks.caller_0.layers.0.bias", 1e-3, ".*; with networks", id="policies"),
         pytest.param(MANY, "networks.caller_1.layers.0.bias", np.nan, ".*; with networks", id="selections"),
         pytest.param(MANY, "networks.end_0.layers.0.bias", 1e-3, ".*; with networks", id="terminations"),
-        pytest.param(LONG, "networks.caller_0.layers.1.bias", 1e-3, r"1\.0e-03, of 1\.0e-06 that", id="steps"),
+        pytest.param(
+            LONG, "networks.caller_0.layers.1.bias", 1e-3, r"1\.0e-03, of 1\.0e-06 that", id="steps"
+        ),
     ],
 )
 def test_every_network_of_every_option_and_step_is_compared(fit, tensor, by, message, tmp_path, damaged):
@@ -318,7 +330,9 @@ def test_what_was_exported_before_is_replaced_by_what_agrees_alone(tmp_path, dam
 
 def test_what_else_is_in_a_folder_is_not_lost(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(BadInput, match=r": holds what was not exported, such as notes\.txt; choose another --out$"):
+    with pytest.raises(
+        BadInput, match=r": holds what was not exported, such as notes\.txt; choose another --out$"
+    ):
         export(make("linear"), tmp_path)
     with pytest.raises(BadInput, match=r"notes\.txt: is a file; choose another --out$"):
         export(make("linear"), tmp_path / "notes.txt")
@@ -326,7 +340,7 @@ def test_what_else_is_in_a_folder_is_not_lost(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-# --- a user's networks ------------------------------------------------------------------------------------------------
+# --- a user's networks --------------------------------------------------------------------------------------
 
 
 class Inner(torch.nn.Module):
@@ -343,7 +357,9 @@ class Inner(torch.nn.Module):
 def test_networks_that_numpy_cannot_evaluate_are_compared_as_a_program(tmp_path):
     fit = make("linear")
     fit.hierarchy.meta_policy.network = UserNetwork(Inner(fit.hierarchy.meta_policy.network), 3, 1)
-    with pytest.raises(BadInput, match=r"networks that numpy cannot evaluate; export it with --out and --onnx$"):
+    with pytest.raises(
+        BadInput, match=r"networks that numpy cannot evaluate; export it with --out and --onnx$"
+    ):
         export(fit, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
     assert list(export(fit, tmp_path / "out", onnx=True)) == ["onnx"]
@@ -392,15 +408,15 @@ def test_networks_that_act_otherwise_or_make_no_program_leave_nothing_behind(net
     assert list(tmp_path.iterdir()) == []
 
 
-# --- how much an exported form may differ: the truth is the same perceptron in float64 --------------------------------
+# --- how much an exported form may differ: the truth is the same perceptron in float64 ----------------------
 
 
 HALF = 32
 
 
 def steep(gain: float) -> Fit:
-    """A policy of pairs of hidden units that differ by 1 / gain, of which it takes gain times the difference: what
-    float32 rounds in a unit it has gain times.
+    """A policy of pairs of hidden units that differ by 1 / gain, of which it takes gain times the difference:
+    what float32 rounds in a unit it has gain times.
     """
     fit = perceptron(2 * HALF)
     first, *_, last = fit.hierarchy.meta_policy.network.layers
@@ -420,11 +436,13 @@ def perceptron(units: int) -> Fit:
 
 
 def measured(folder: Path) -> float:
-    """How far the original's controls are from those of float64: what it says of an episode at once (``control_0``),
-    and what it did (``controls``), one step after the other.
+    """How far the original's controls are from those of float64: what it says of an episode at once
+    (``control_0``), and what it did (``controls``), one step after the other.
     """
     with np.load(folder / "weights.npz") as file:
-        names = [f"networks.caller_0.layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
+        names = [
+            f"networks.caller_0.layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")
+        ]
         weight, bias, weight_2, bias_2 = (file[name][0].astype(np.float64) for name in names)
     largest = 0.0
     with np.load(folder / "check.npz") as file:
@@ -432,7 +450,9 @@ def measured(folder: Path) -> float:
             seen = file[f"observation_{episode}_state"].astype(np.float32).astype(np.float64)
             exact = np.maximum(seen @ weight + bias, 0) @ weight_2 + bias_2
             for name in ("control_0", "controls"):
-                error = np.abs(file[f"{name}_{episode}"].reshape(exact.shape) - exact) / np.maximum(1, np.abs(exact))
+                error = np.abs(file[f"{name}_{episode}"].reshape(exact.shape) - exact) / np.maximum(
+                    1, np.abs(exact)
+                )
                 largest = max(largest, error.max())
     return largest
 

@@ -32,7 +32,9 @@ def labelled() -> Demonstrations:
     """With a label that is used, one that is not, and a mask."""
     demos = two_skills()
     records = tuple(
-        replace(one, labels={"phase": (np.arange(len(one)) > 3).astype(int), "other": np.zeros(len(one), int)})
+        replace(
+            one, labels={"phase": (np.arange(len(one)) > 3).astype(int), "other": np.zeros(len(one), int)}
+        )
         for one in demos
     )
     return Demonstrations(records, {"valid": demos.names[:3], "few": demos.names[:2]})
@@ -57,7 +59,10 @@ def edited(path: Path, edit: Callable[[h5py.File], object]) -> None:
 
 CHANGES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "a control": (lambda file: file["data/demo_4/actions"].write_direct(np.ones((9, 2))), "actions changed"),
-    "an observation": (lambda file: file["data/demo_4/obs/turn"].__setitem__((0, 0), 7.0), "obs/turn changed"),
+    "an observation": (
+        lambda file: file["data/demo_4/obs/turn"].__setitem__((0, 0), 7.0),
+        "obs/turn changed",
+    ),
     "two observations": (
         lambda file: [file[f"data/demo_4/obs/{key}"].__setitem__((0, 0), 7.0) for key in ("place", "turn")],
         "obs/place and obs/turn changed",
@@ -175,7 +180,9 @@ def test_the_digest_sees_every_number() -> None:
     assert difference(digest(first), digest(backwards)) == "their order differs"
 
 
-def test_pictures_are_read_once_and_again_where_their_file_has_changed(few_dots: Path, tmp_path: Path, monkeypatch):
+def test_pictures_are_read_once_and_again_where_their_file_has_changed(
+    few_dots: Path, tmp_path: Path, monkeypatch
+):
     """What is in the file decides, not when it was written: a copy is the same, an edit is not."""
     read = []
     monkeypatch.setattr(fitted_to, "blocks", lambda array: read.append(array) or [np.asarray(array)])

@@ -31,11 +31,14 @@ def hidden_markov_model() -> GaussianHMM:
     model = GaussianHMM(3, "diag")
     model.startprob_, ending = np.array([0.5, 0.3, 0.2]), np.array([[0.1], [0.2], [0.15]])
     model.transmat_ = np.diag(1 - ending[:, 0]) + ending * model.startprob_
-    model.means_, model.covars_ = np.array([[0, 0], [3, 1], [-2, 4.0]]), np.array([[0.5, 0.2], [0.3, 0.4], [0.6, 0.6]])
+    model.means_, model.covars_ = (
+        np.array([[0, 0], [3, 1], [-2, 4.0]]),
+        np.array([[0.5, 0.2], [0.3, 0.4], [0.6, 0.6]]),
+    )
     return model
 
 
-# --- the same fit -----------------------------------------------------------------------------------------------------
+# --- the same fit -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +49,10 @@ def fitted() -> OptionSegmenter:
 def test_it_is_the_fit_of_its_spec(fitted: OptionSegmenter) -> None:
     X, U = two_options()
     demos = ddco_pyro.Demonstrations(
-        tuple(ddco_pyro.Demonstration(f"sequence_{n}", {"x": x}, u) for n, (x, u) in enumerate(zip(X, U, strict=True)))
+        tuple(
+            ddco_pyro.Demonstration(f"sequence_{n}", {"x": x}, u)
+            for n, (x, u) in enumerate(zip(X, U, strict=True))
+        )
     )
     fit = ddco_pyro.fit(fitted.spec_, demos)
     assert fitted.spec_.seed == 3
@@ -87,7 +93,9 @@ def test_perceptrons_and_other_settings() -> None:
     X, U = two_options()
     settings = {**QUICK, "hierarchy.levels.0.policy.hidden": [4], "compare_with": ["mixture"]}
     settings |= {"demonstrations.valid_fraction": 0.2}
-    model = OptionSegmenter(2, policy="mlp", differences=False, random_state=None, settings=settings).fit(X, U)
+    model = OptionSegmenter(2, policy="mlp", differences=False, random_state=None, settings=settings).fit(
+        X, U
+    )
     assert model.fit_.spec.hierarchy.levels[0].policy.hidden == (4,)
     assert set(model.fit_.baselines) == {"mixture"}
     assert model.fit_.metrics.demonstrations.valid == 1
@@ -101,7 +109,10 @@ def test_perceptrons_and_other_settings() -> None:
         (lambda model, X, U: model.predict(X, U, [16] * 5), "leave lengths out"),
         (lambda model, X, U: model.set_params(settings={"training.epoch": 3}).fit(X, U), "training.epochs"),
         (lambda model, X, U: model.set_params(n_options=2.5).fit(X, U), "^n_options: must be a whole number"),
-        (lambda model, X, U: model.set_params(random_state="x").fit(X, U), "^random_state='x': has to be a whole"),
+        (
+            lambda model, X, U: model.set_params(random_state="x").fit(X, U),
+            "^random_state='x': has to be a whole",
+        ),
         (lambda model, X, U: model.predict([np.hstack([x, x]) for x in X], U), "X has 4 features, but"),
         (lambda model, X, U: model.score(X, [np.hstack([u, u]) for u in U]), r"actions has shape \(4,\)"),
         (lambda model, X, U: model.predict_proba(X, [np.nan * u for u in U]), "U contains NaN"),
@@ -123,7 +134,10 @@ def listed(values: Any, make: Any) -> list[Any]:
 
 KINDS = {
     "a 3-D array": lambda _, X, U: (np.array(X), np.array(U)),
-    "pandas": lambda pd, X, U: (listed(X, lambda x: pd.DataFrame(x, index=range(9, 25))), listed(U, pd.DataFrame)),
+    "pandas": lambda pd, X, U: (
+        listed(X, lambda x: pd.DataFrame(x, index=range(9, 25))),
+        listed(U, pd.DataFrame),
+    ),
     "a polars frame, lengths in a series": lambda pl, X, U: (
         pl.DataFrame(np.concatenate(X)),
         pl.DataFrame(np.concatenate(U)),
@@ -154,7 +168,7 @@ def test_the_columns_of_a_frame_have_to_be_those_of_the_fit() -> None:
         model.predict(X, listed(U, lambda rows: rows[["b", "a"]]))
 
 
-# --- hmmlearn ---------------------------------------------------------------------------------------------------------
+# --- hmmlearn -----------------------------------------------------------------------------------------------
 
 
 def test_without_controls_it_is_a_hidden_markov_model() -> None:
@@ -193,7 +207,7 @@ def test_it_fits_a_hidden_markov_model_as_well_as_hmmlearn() -> None:
     np.testing.assert_allclose(shares[order], long_run[order], atol=0.1)
 
 
-# --- scikit-learn -----------------------------------------------------------------------------------------------------
+# --- scikit-learn -------------------------------------------------------------------------------------------
 
 
 def test_sequences_are_the_samples_of_model_selection() -> None:

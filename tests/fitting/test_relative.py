@@ -17,7 +17,9 @@ from ddco_pyro.exporting.runner import Runner
 from ddco_pyro.spec import SpecError, with_overrides
 
 ABSOLUTE = targets(velocities())
-BY_HAND = Demonstrations(tuple(replace(demo, actions=demo.actions - demo.observations["gripper"]) for demo in ABSOLUTE))
+BY_HAND = Demonstrations(
+    tuple(replace(demo, actions=demo.actions - demo.observations["gripper"]) for demo in ABSOLUTE)
+)
 """The differences of the targets, which are the velocities, up to rounding."""
 
 SPEC = small_spec(
@@ -64,7 +66,9 @@ def test_its_monitor_takes_targets(fits: Fits) -> None:
     for step in range(10):
         seen = {key: rows[step] for key, rows in ABSOLUTE[2].observations.items()}
         before = (demos[2].actions[step - 1] if step else None for demos in (ABSOLUTE, BY_HAND))
-        one, other = (monitor.step(seen, control) for monitor, control in zip((ours, theirs), before, strict=True))
+        one, other = (
+            monitor.step(seen, control) for monitor, control in zip((ours, theirs), before, strict=True)
+        )
         assert one == other
     assert ours.log_likelihood == theirs.log_likelihood
 

@@ -41,13 +41,17 @@ def compare(counts, steps, seed):
     hybrid = tuple(bool(seed >> level & 1) for level in range(len(counts)))
     tables = random_tables(counts, hybrid, trajectories=len(grid), steps=steps, seed=seed)
     generator = torch.Generator().manual_seed(seed)
-    impossible = 0.4 * torch.rand(len(grid), generator=generator) * (torch.rand(len(grid), generator=generator) < 0.8)
+    impossible = (
+        0.4 * torch.rand(len(grid), generator=generator) * (torch.rand(len(grid), generator=generator) < 0.8)
+    )
 
     def each(values, table):
         return values.reshape(-1, *[1] * (table.dim() - 1))
 
     def holes(table):
-        return torch.where(torch.rand(table.shape, generator=generator) < each(impossible, table), NEVER, table)
+        return torch.where(
+            torch.rand(table.shape, generator=generator) < each(impossible, table), NEVER, table
+        )
 
     control = tuple(holes(each(sharp, table) * table) for table in tables.control)
     same = each(identical, control[0])
@@ -82,7 +86,8 @@ def test_two_hundred_joint_choices(counts):
 
 
 @pytest.mark.parametrize(
-    ("steps", "sharp"), [(3000, 1.0), *(pytest.param(10_000, sharp, marks=pytest.mark.slow) for sharp in (1.0, 100.0))]
+    ("steps", "sharp"),
+    [(3000, 1.0), *(pytest.param(10_000, sharp, marks=pytest.mark.slow) for sharp in (1.0, 100.0))],
 )
 def test_thousands_of_steps(steps, sharp):
     tables, lengths = random_tables((5,), (True,), steps=steps, seed=8), torch.tensor([steps])

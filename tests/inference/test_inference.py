@@ -53,7 +53,9 @@ def test_posterior_is_the_marginal_over_paths(counts, hybrid, steps, power):
         truth = brute_force(tables, n, length)
         for name, d in itertools.product("uvw", range(len(counts))):
             table = getattr(found, name)[d][n]
-            np.testing.assert_allclose(table[:length].numpy(), getattr(truth, name)[d], atol=1e-9, err_msg=name)
+            np.testing.assert_allclose(
+                table[:length].numpy(), getattr(truth, name)[d], atol=1e-9, err_msg=name
+            )
             assert not table[length:].any()
 
 
@@ -93,7 +95,7 @@ def test_compiled_code_is_in_one_file():
     assert [path.name for path in root.rglob("*.py") if "import numba" in path.read_text()] == ["kernel.py"]
 
 
-# --- the online filter ------------------------------------------------------------------------------------------------
+# --- the online filter --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -107,7 +109,9 @@ def test_the_belief_is_what_the_past_says(counts, hybrid, steps, power, evident)
     if evident:
         random = torch.Generator().manual_seed(3)
         for level, size in enumerate(tables.sizes, start=1):
-            tables = tables.with_evidence(level, torch.randn(2, steps, size, generator=random, dtype=torch.float64))
+            tables = tables.with_evidence(
+                level, torch.randn(2, steps, size, generator=random, dtype=torch.float64)
+            )
     filtering, lengths = Filter(power), torch.tensor([steps, steps])
     density = joint_density(tables.control).unbind(1)
     for t, now in enumerate(complete(tables, lengths).steps()):
@@ -131,7 +135,9 @@ def test_the_predictive_density_is_that_of_every_path_so_far(counts, hybrid, ste
     tables = replace(random_tables(counts, hybrid, trajectories=2, steps=steps, seed=5), power=power)
     lengths = torch.tensor([steps, max(steps - 1, 1)])
     found = log_predictive(tables, lengths)
-    truth = [sum(step.value for step in predictions(tables, n, int(length))) for n, length in enumerate(lengths)]
+    truth = [
+        sum(step.value for step in predictions(tables, n, int(length))) for n, length in enumerate(lengths)
+    ]
     np.testing.assert_allclose(found.numpy(), truth, atol=1e-9)
     if power == 1:
         torch.testing.assert_close(found, log_likelihood(tables, lengths))
@@ -155,7 +161,7 @@ def test_updates_without_a_possible_control_are_refused():
         filtering.update(torch.full_like(now.emission, NEVER))
 
 
-# --- what is refused, and what is taken -------------------------------------------------------------------------------
+# --- what is refused, and what is taken ---------------------------------------------------------------------
 
 
 DOOR = {
@@ -182,7 +188,10 @@ TABLES = {
         lambda t: _changed(t, "selection", 1, t.selection[1][:, :, 0]),
         r"selection\[1\]: expected \[N, T, callers, 1 \+ options\]",
     ),
-    "no control": (lambda t: replace(t, control=()), "control: tables with 2 levels of selections need 3; got 0"),
+    "no control": (
+        lambda t: replace(t, control=()),
+        "control: tables with 2 levels of selections need 3; got 0",
+    ),
     "evidence of one level": (lambda t: replace(t, evidence=(None,)), r"evidence: .* need 2; got 1"),
     "NaN": (
         lambda t: _changed(t, "control", 0, _with(t.control[0], (1, 3, 0), torch.nan)),
@@ -261,7 +270,9 @@ def test_the_gradient_of_the_evidence_is_that_of_differences(counts, levels):
             for sign in (1, -1):
                 with torch.no_grad():
                     leaf[place] += sign * step
-                    sides.append(float(inference.log_likelihood(replace(tables, evidence=evidence), lengths).sum()))
+                    sides.append(
+                        float(inference.log_likelihood(replace(tables, evidence=evidence), lengths).sum())
+                    )
                     leaf[place] -= sign * step
             differences[place] = (sides[0] - sides[1]) / (2 * step)
         for engine in gradients:
@@ -289,7 +300,12 @@ def test_the_eliminated_model_refuses_lengths_and_controls_of_others():
     hierarchy, batch = make_hierarchy((3,)), make_batch()
     with torch.no_grad():
         outputs = hierarchy(batch.inputs)
-    for wrong in (batch.lengths[:1], batch.lengths + 100, batch.lengths - batch.lengths, batch.lengths.double()):
+    for wrong in (
+        batch.lengths[:1],
+        batch.lengths + 100,
+        batch.lengths - batch.lengths,
+        batch.lengths.double(),
+    ):
         with pytest.raises(BadInput, match="lengths"):
             EliminatedAHMM(outputs, wrong)
     distribution = EliminatedAHMM(outputs, batch.lengths)

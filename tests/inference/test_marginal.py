@@ -45,7 +45,11 @@ def step(model, elbo, guide_class, seed):
     pyro.set_rng_seed(seed)
     with pyro.poutine.trace(param_only=True) as seen:
         loss = elbo.differentiable_loss(model, guide)
-    leaves = {name: site["value"].unconstrained() for name, site in seen.trace.nodes.items() if site["type"] == "param"}
+    leaves = {
+        name: site["value"].unconstrained()
+        for name, site in seen.trace.nodes.items()
+        if site["type"] == "param"
+    }
     return loss.item(), dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
 
 
@@ -90,7 +94,9 @@ def test_draws_follow_the_model():
         means = torch.cat([outputs.emissions[1].mean, outputs.emissions[0].mean], dim=2).double()
         expected = (weights.unsqueeze(-1) * means).sum(2)
     for n, length in enumerate(batch.lengths.tolist()):
-        np.testing.assert_allclose(drawn[:, n, :length].mean(0), expected[n, :length], atol=5 * 1.0 / 400**0.5)
+        np.testing.assert_allclose(
+            drawn[:, n, :length].mean(0), expected[n, :length], atol=5 * 1.0 / 400**0.5
+        )
         assert not drawn[:, n, length:].any()
     assert drawn[0].shape == (*distribution.batch_shape, *distribution.event_shape)
 

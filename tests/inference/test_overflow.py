@@ -93,7 +93,9 @@ class Undefined(torch.nn.Module):
 
 def test_networks_that_give_no_numbers_are_named_before_training() -> None:
     spec = small_spec(policy={"network": f"{__name__}:Undefined"})
-    with pytest.raises(TrainingError, match="before any training a network gives values that are NaN or infinite; loo"):
+    with pytest.raises(
+        TrainingError, match="before any training a network gives values that are NaN or infinite; loo"
+    ):
         fit(spec, of_states([5] * 5))
 
 
@@ -102,5 +104,7 @@ def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:
     found = fit(small_spec(training={"epochs": 1}), demos, out=tmp_path / "run")
     with torch.no_grad():
         next(found.hierarchy.levels[0].policy.parameters())[:] = torch.inf
-    with pytest.raises(Failed, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "):
+    with pytest.raises(
+        Failed, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "
+    ):
         evaluate(found, Mock(), Mock(), {"train": demos}, contained=(), whole=False)

@@ -89,7 +89,9 @@ def tabs(browser):
         tab.add_init_script(script)
         tab.on("response", lambda answer: complaints.append(answer.text()) if answer.status == 500 else None)
         tab.on("pageerror", lambda error: complaints.append(str(error)))
-        tab.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+        tab.on(
+            "console", lambda message: complaints.append(message.text) if message.type == "error" else None
+        )
         own = (address, "data:", "blob:")
         tab.on("request", lambda asked: None if asked.url.startswith(own) else complaints.append(asked.url))
         tab.goto(address)

@@ -21,7 +21,13 @@ QUICK = settings(max_examples=25, suppress_health_check=[HealthCheck.function_sc
 def paints(draw):
     name = draw(st.sampled_from([*LENGTHS]))
     start = draw(st.integers(0, LENGTHS[name] - 1))
-    return "paint", name, start, draw(st.integers(start + 1, LENGTHS[name])), draw(st.sampled_from([OPEN, FREE, 1, 2]))
+    return (
+        "paint",
+        name,
+        start,
+        draw(st.integers(start + 1, LENGTHS[name])),
+        draw(st.sampled_from([OPEN, FREE, 1, 2])),
+    )
 
 
 name = st.sampled_from([*LENGTHS])
@@ -31,7 +37,9 @@ change = st.one_of(
     st.tuples(st.just("accept"), name, st.booleans(), st.floats(0, 9), st.integers(0, 9)),
     st.tuples(st.just("names"), st.sampled_from([NAMES, ("push", "grasp"), (*NAMES, "lift")])),
 )
-actions = st.lists(st.one_of(st.lists(change, min_size=1, max_size=4), st.sampled_from(["undo", "redo"])), max_size=12)
+actions = st.lists(
+    st.one_of(st.lists(change, min_size=1, max_size=4), st.sampled_from(["undo", "redo"])), max_size=12
+)
 
 
 def empty():
@@ -41,7 +49,12 @@ def empty():
 def said(document):
     """What a document says, in plain data."""
     labels = {name: own.tolist() for name, own in document.labels.items()}
-    return labels, {name: set(own) for name, own in document.cuts.items()}, dict(document.accepted), document.names
+    return (
+        labels,
+        {name: set(own) for name, own in document.cuts.items()},
+        dict(document.accepted),
+        document.names,
+    )
 
 
 def act(labels, action):
@@ -110,7 +123,9 @@ def test_a_journal_torn_at_any_byte_gives_the_state_after_its_whole_lines(tmp_pa
     path.write_bytes(content[:size])
     again = empty()
     journal = Journal(path, again, "option")
-    assert said(again) == next((states[at] for at in sorted(states, reverse=True) if at <= size), said(empty()))
+    assert said(again) == next(
+        (states[at] for at in sorted(states, reverse=True) if at <= size), said(empty())
+    )
     journal.write([("paint", "demo_1", 0, 3, 1)])  # what follows a torn line is kept whole
     journal.close()
     third = empty()
@@ -119,7 +134,10 @@ def test_a_journal_torn_at_any_byte_gives_the_state_after_its_whole_lines(tmp_pa
 
 
 def recorded(lengths=LENGTHS, control=0.0):
-    each = [(name, {"place": np.zeros((steps, 1))}, np.full((steps, 2), control)) for name, steps in lengths.items()]
+    each = [
+        (name, {"place": np.zeros((steps, 1))}, np.full((steps, 2), control))
+        for name, steps in lengths.items()
+    ]
     return Demonstrations([Demonstration(*own) for own in each])
 
 
@@ -138,7 +156,9 @@ def test_edits_of_something_else_are_refused_and_kept(tmp_path, other):
     journal.write([("paint", "demo_0", 0, 6, 1)])
     journal.close()
     content = path.read_bytes()
-    with pytest.raises(BadInput, match="edits of other demonstrations or of another level; give another --out"):
+    with pytest.raises(
+        BadInput, match="edits of other demonstrations or of another level; give another --out"
+    ):
         Journal(path, empty(), other)
     assert path.read_bytes() == content
     Journal(path, empty(), ours).close()  # and left to others

@@ -23,7 +23,9 @@ def test_expected_wrong_steps_are_the_planted_ones_whatever_the_posterior_misses
     assert expected_wrong(shown, free, found) == pytest.approx((shown.options != truth).sum(), rel=0.1)
     half = np.where(np.arange(20_000) < 10_000, truth, -1)
     half[15_000:] = -2  # what is left open is none's fault
-    assert expected_wrong(shown, half, found) == pytest.approx(expected_wrong(shown, free, found) / 4, rel=0.1)
+    assert expected_wrong(shown, half, found) == pytest.approx(
+        expected_wrong(shown, free, found) / 4, rel=0.1
+    )
 
 
 def test_steps_without_a_name_say_nothing_of_a_proposal():
@@ -35,7 +37,10 @@ def test_steps_without_a_name_say_nothing_of_a_proposal():
 def order_of(wrong, edits, centres, accepted=()):
     count = len(wrong)
     return ranking(
-        np.array(wrong, float), np.array(edits, float), np.array(centres, float), np.isin(np.arange(count), accepted)
+        np.array(wrong, float),
+        np.array(edits, float),
+        np.array(centres, float),
+        np.isin(np.arange(count), accepted),
     )
 
 
@@ -43,7 +48,12 @@ def test_a_long_odd_demonstration_comes_after_usual_ones_with_fewer_wrong_steps(
     wrong, edits = [10, 11, 12, 40], [2, 2, 2, 12]
     centres = [[0.0], [0.1], [0.2], [3.0]]
     assert order_of(wrong, edits, centres)[0] == [2, 1, 0, 3]
-    assert order_of(wrong, [2] * 4, [[0.0]] * 4)[0] == [3, 2, 1, 0]  # equally odd and costly: the most wrong steps
+    assert order_of(wrong, [2] * 4, [[0.0]] * 4)[0] == [
+        3,
+        2,
+        1,
+        0,
+    ]  # equally odd and costly: the most wrong steps
     assert order_of([10] * 4, edits, [[0.0]] * 4)[0][-1] == 3  # costly alone
     assert order_of([10] * 4, [2] * 4, centres)[0][-1] == 3  # odd alone
 

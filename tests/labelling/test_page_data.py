@@ -23,7 +23,9 @@ pytestmark = needed
 def test_demonstrations_are_found_by_their_task(tabs, begun, tmp_path):
     path = tmp_path / "demos.hdf5"
     tasks = ("push", "open", "push", "close", "push")
-    demos = (replace(demo, attributes={"task": task}) for demo, task in zip(pick_and_place(5), tasks, strict=True))
+    demos = (
+        replace(demo, attributes={"task": task}) for demo, task in zip(pick_and_place(5), tasks, strict=True)
+    )
     Demonstrations(tuple(demos)).write(path)
     with served(begun(path=path)) as address:
         tab = tabs(address)
@@ -143,7 +145,9 @@ FRAMES = """async work => {
 def test_two_hundred_demonstrations_of_two_thousand_steps_stay_smooth(tabs, begun, tmp_path):
     def slowed(demo):
         rows = np.linspace(0, len(demo) - 1, 2000).astype(int)
-        return Demonstration(demo.name, {key: own[rows] for key, own in demo.observations.items()}, demo.actions[rows])
+        return Demonstration(
+            demo.name, {key: own[rows] for key, own in demo.observations.items()}, demo.actions[rows]
+        )
 
     Demonstrations(tuple(map(slowed, pick_and_place(200)))).write(tmp_path / "demos.hdf5")
     with served(begun(path=tmp_path / "demos.hdf5")) as address:

@@ -19,7 +19,7 @@ from ddco_pyro.errors import BadInput
 from ddco_pyro.fitting.fitted import load
 from ddco_pyro.labelling.session import Session
 
-# --- exports ----------------------------------------------------------------------------------------------------------
+# --- exports ------------------------------------------------------------------------------------------------
 
 GIVEN, LEFT = range(10), range(10, 25)
 """The steps of a demonstration that a person gives and leaves open; the others are accepted or left to the model."""
@@ -46,9 +46,9 @@ def test_tables_say_who_says_each_step_and_have_no_option_where_steps_are_open(m
     for index in (0, 1):
         own = [row for row in rows if row["demonstration"] == f"demo_{index}"]
         assert [row["skill_source"] for row in own] == sources_of(index, demos)
-        assert {(own[step]["skill"], own[step]["skill_name"], own[step]["skill_probability"]) for step in LEFT} == {
-            ("-1", "", "0.0")
-        }
+        assert {
+            (own[step]["skill"], own[step]["skill_name"], own[step]["skill_probability"]) for step in LEFT
+        } == {("-1", "", "0.0")}
         assert {own[step]["skill"] for step in GIVEN} == {"3"}
         assert all(int(row["skill"]) > 0 for row in own[25:])
     page = mixed.export("html", tmp_path).read_text()
@@ -62,7 +62,9 @@ def test_other_programs_get_a_gap_where_steps_are_open_and_who_says_each_segment
     tasks = json.loads((mixed.export("label-studio", tmp_path) / "tasks.json").read_text())
     for index in (0, 1):
         root = ElementTree.parse(folder / f"demo_{index}.eaf").getroot()
-        slots = {own.get("TIME_SLOT_ID"): int(own.get("TIME_VALUE")) // 1000 for own in root.iter("TIME_SLOT")}
+        slots = {
+            own.get("TIME_SLOT_ID"): int(own.get("TIME_VALUE")) // 1000 for own in root.iter("TIME_SLOT")
+        }
         tiers = {
             tier.get("TIER_ID"): {
                 step: own.findtext("ANNOTATION_VALUE")
@@ -102,7 +104,9 @@ def test_labels_of_another_program_are_gone_on_with_by_their_names(begun, run, d
     truth[0][-3:] = 4
     each = (replace(demo, labels={"skill": own}) for demo, own in zip(demos, truth, strict=True))
     Demonstrations(tuple(each), attributes={LABEL_NAMES: json.dumps({"skill": names})}).write(path)
-    session = begun(path=path, fit=replace(run, named={"skill": ("carry", "option 2", "option 3", "option 4")}))
+    session = begun(
+        path=path, fit=replace(run, named={"skill": ("carry", "option 2", "option 3", "option 4")})
+    )
     own = session.document.names
     assert (own[0], {*own}) == ("carry", {*names})
     for name, expected in zip(demos.names, truth, strict=True):
@@ -110,7 +114,7 @@ def test_labels_of_another_program_are_gone_on_with_by_their_names(begun, run, d
         assert said == [names[value] if value >= 0 else "" for value in expected]
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files --------------------------------------------------------------------------------------------------
 
 
 def test_saved_labels_are_read_back_with_minus_one_where_nothing_is_said(begin, demos, tmp_path):

@@ -36,7 +36,7 @@ def by_step(segments):
     return [(own["option"], own["source"]) for own in segments for _ in range(own["start"], own["stop"])]
 
 
-# --- what is shown ----------------------------------------------------------------------------------------------------
+# --- what is shown ------------------------------------------------------------------------------------------
 
 
 def test_before_any_label_the_fit_proposes(begin, run, demos):
@@ -47,7 +47,9 @@ def test_before_any_label_the_fit_proposes(begin, run, demos):
         found = session.demo(index)
         assert by_step(found["segments"]) == [(option, "proposed") for option in path.tolist()]
         probability = u[index].numpy()[np.arange(len(path)), path]
-        np.testing.assert_array_equal(unpacked(found["probability"]), np.rint(255 * np.minimum(probability, 1)))
+        np.testing.assert_array_equal(
+            unpacked(found["probability"]), np.rint(255 * np.minimum(probability, 1))
+        )
         wrong.append((1 - probability + USUAL * probability).sum())
         assert [own["step"] for own in found["boundaries"]] == (np.flatnonzero(np.diff(path)) + 1).tolist()
         for own in found["boundaries"]:
@@ -61,7 +63,7 @@ def test_before_any_label_the_fit_proposes(begin, run, demos):
     assert (state["can_undo"], state["can_redo"], state["dirty"]) == (False, False, False)
 
 
-# --- commands ---------------------------------------------------------------------------------------------------------
+# --- commands -----------------------------------------------------------------------------------------------
 
 paint = {"do": "paint", "demo": 0, "start": 10, "stop": 20, "option": 3}
 SAID = np.repeat([1, 3, 2, 4], [10, 10, 10, 18])
@@ -76,7 +78,10 @@ SAID = np.repeat([1, 3, 2, 4], [10, 10, 10, 18])
         ([{"do": "merge", "demo": 0, "step": 10}], {(10, 30): 3}),
         ([{"do": "move", "demo": 0, "boundary": 20, "to": 25}], {(10, 25): 3}),
         ([{"do": "move", "demo": 0, "boundary": 20, "to": 15}], {(15, 30): 2}),
-        ([{"do": "split", "demo": 0, "step": 15}, {"do": "name", "demo": 0, "step": 15, "option": 4}], {(15, 20): 4}),
+        (
+            [{"do": "split", "demo": 0, "step": 15}, {"do": "name", "demo": 0, "step": 15, "option": 4}],
+            {(15, 20): 4},
+        ),
         ([{"do": "split", "demo": 0, "step": 15}, {"do": "merge", "demo": 0, "step": 12}], {}),
         ([{"do": "open", "demo": 0, "step": 19}, {"do": "undo"}, {"do": "redo"}], {(10, 20): OPEN}),
     ],
@@ -146,7 +151,9 @@ def test_accepting_says_what_is_seen_except_what_is_open(begin):
     assert not session.document.accepted
     seen = [[0, 1], [20, 2]]  # whatever is shown meanwhile
     session.edit({"do": "accept", "demo": 0, "segments": seen})
-    assert session.document.labels["demo_0"].tolist() == [1] * 20 + [2] * (len(session.document.labels["demo_0"]) - 20)
+    assert session.document.labels["demo_0"].tolist() == [1] * 20 + [2] * (
+        len(session.document.labels["demo_0"]) - 20
+    )
 
 
 @pytest.mark.usefixtures("quiet")
@@ -239,7 +246,10 @@ def test_an_excluded_demonstration_is_last_and_in_no_export_and_in_a_mask(begin,
     saved = Demonstrations.read(session.out)
     assert saved.masks["exclude"] == (name,)
     assert saved[first].attributes["note"] == "slipped"
-    assert name in starting_spec(inspect(session.out), session.out).text.partition("exclude:")[2].partition("\n")[0]
+    assert (
+        name
+        in starting_spec(inspect(session.out), session.out).text.partition("exclude:")[2].partition("\n")[0]
+    )
     session.edit({"do": "mark", "demo": first, "mark": "exclude", "value": False})
     session.save()
     assert "exclude" not in Demonstrations.read(session.out).masks
@@ -250,7 +260,11 @@ def test_what_changes_nothing_is_no_edit(begin):
     commands = [paint, {"do": "rename", "option": 1, "text": "come"}, {**paint, "demo": 1, "option": 0}]
     assert all(session.edit(command)["done"] for command in commands)
     content = session.journal.path.read_bytes()
-    again = [*commands, {"do": "name", "demo": 0, "step": 12, "option": 3}, {"do": "open", "demo": 1, "step": 12}]
+    again = [
+        *commands,
+        {"do": "name", "demo": 0, "step": 12, "option": 3},
+        {"do": "open", "demo": 1, "step": 12},
+    ]
     assert not any(session.edit(command)["done"] for command in [*again, {"do": "reopen", "demo": 0}])
     assert session.journal.path.read_bytes() == content
 
@@ -310,14 +324,18 @@ def test_a_command_that_cannot_be_done_is_one_line_and_changes_nothing(begun, co
     assert (shown(session), session.journal.path.read_bytes()) == (before, content)
 
 
-# --- refits -----------------------------------------------------------------------------------------------------------
+# --- refits -------------------------------------------------------------------------------------------------
 
 
 def right(session, demos, rest):
     """The share of right steps of these demonstrations, where options are labelled in the opposite order."""
     pairs = [(shown(session)[index][1], demos[index].labels["phase"]) for index in rest]
     return np.mean(
-        [option == COUNT - truth for steps, own in pairs for (option, _), truth in zip(steps, own, strict=True)]
+        [
+            option == COUNT - truth
+            for steps, own in pairs
+            for (option, _), truth in zip(steps, own, strict=True)
+        ]
     )
 
 

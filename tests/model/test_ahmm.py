@@ -39,7 +39,8 @@ def repeated(tables, times):
 
 
 @pytest.mark.parametrize(
-    ("counts", "hybrid", "steps"), [((2,), (True,), 4), ((2, 2), (False, True), 3), ((1, 1, 1), (True, True, True), 3)]
+    ("counts", "hybrid", "steps"),
+    [((2,), (True,), 4), ((2, 2), (False, True), 3), ((1, 1, 1), (True, True, True), 3)],
 )
 def test_latents_are_as_frequent_as_the_sum_over_paths_says(counts, hybrid, steps):
     """Controls of density 1 tell nothing, so what is sampled has the marginals of the prior."""

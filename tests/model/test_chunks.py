@@ -23,7 +23,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "mlp": {"policy": {"network": "mlp", "hidden": [8], "dropout": 0.3, "inputs": ["state"]}},
     "conv": {"policy": {**CONV, "dropout": 0.3}},
     "lstm over conv": {"policy": {"network": "lstm", "over": CONV, "hidden": 5}},
-    "lstm over conv, a horizon": {"policy": {"network": "lstm", "over": CONV, "hidden": [5, 3], "horizon": 5}},
+    "lstm over conv, a horizon": {
+        "policy": {"network": "lstm", "over": CONV, "hidden": [5, 3], "horizon": 5}
+    },
     "lstm over branches, a trunk": {
         "whole": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}
     },
@@ -32,7 +34,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "per_timestep": {"policy": {"network": "per_timestep", "hidden": [4], "inputs": ["state"]}},
 }
 TRAJECTORIES, STEPS = 2, 13
-assert {"linear", *re.findall(r"'network': '(\w+)'", str(NETWORKS))} == set(CLASSES), "a new network belongs here"
+assert {"linear", *re.findall(r"'network': '(\w+)'", str(NETWORKS))} == set(CLASSES), (
+    "a new network belongs here"
+)
 
 
 def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:
@@ -97,7 +101,9 @@ def test_a_chunk_drops_the_same_in_both_passes(network: str, monkeypatch: pytest
     model, seen = hierarchy(network), batch()
     in_chunks(monkeypatch, model, 4)
     again = value_and_gradient(model, seen, None)
-    monkeypatch.setattr("ddco_pyro.model.hierarchy.checkpoint", lambda call, *arguments, **_: call(*arguments))
+    monkeypatch.setattr(
+        "ddco_pyro.model.hierarchy.checkpoint", lambda call, *arguments, **_: call(*arguments)
+    )
     kept = value_and_gradient(model, seen, None)
     assert again[0] == kept[0]
     assert (again[1] - kept[1]).abs().max() <= 1e-10 * kept[1].abs().max()

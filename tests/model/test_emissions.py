@@ -37,10 +37,12 @@ def test_a_control_can_be_conditioned_on():
     elbo = pyro.infer.TraceEnum_ELBO(max_plate_nesting=1, strict_enumeration_warning=False)
     conditioned = pyro.condition(ahmm, data=given)
     value = -elbo.loss(conditioned, lambda *_: None, chain, outputs.emissions)
-    assert value == pytest.approx(float(log_likelihood(outputs.tables(actions), batch.lengths).sum()), rel=1e-5)
+    assert value == pytest.approx(
+        float(log_likelihood(outputs.tables(actions), batch.lengths).sum()), rel=1e-5
+    )
 
 
-# --- kinds ------------------------------------------------------------------------------------------------------------
+# --- kinds --------------------------------------------------------------------------------------------------
 
 STD = torch.tensor([0.4, 1.3], dtype=torch.float64)
 SCALE = torch.tensor([2.0, 0.5], dtype=torch.float64)
@@ -140,7 +142,9 @@ KINDS = {
         numbers(2, 3, 2, 1, seed=2), numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD])
     ),
     "hurdles": lambda: Product((((1,), one_hurdle(5)), ((0,), one_hurdle(6)))),
-    "product": lambda: Product((((2, 0), clipped(numbers(2, 3, 2, 2))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
+    "product": lambda: Product(
+        (((2, 0), clipped(numbers(2, 3, 2, 2))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))
+    ),
 }
 
 
@@ -212,7 +216,9 @@ def test_draws_of_a_student_have_its_radius_and_its_controller():
     assert stats.kstest(radius, stats.f(2, 4).cdf).pvalue > 0.01
     part = {"scale": [1.0, 1.0], "shift": [0.0, 0.0], "ends": [[], []]}
     for own, z in zip(drawn[:200], noise.numpy(), strict=False):
-        np.testing.assert_allclose(student_control(part, emission.mean[0].numpy(), STD.numpy(), z), own, rtol=1e-10)
+        np.testing.assert_allclose(
+            student_control(part, emission.mean[0].numpy(), STD.numpy(), z), own, rtol=1e-10
+        )
 
 
 def test_the_divergence_of_students_is_at_least_that_of_draws():
@@ -231,7 +237,9 @@ def test_the_divergence_of_students_is_at_least_that_of_draws():
 
 @pytest.mark.parametrize(("dtype", "precision"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
 def test_log_of_the_normal_distribution_function(dtype, precision):
-    values = torch.cat([torch.linspace(-60, 12, 2001), torch.tensor([-1e9, -1e4, -30.0, 0.0, 40.0])]).to(dtype)
+    values = torch.cat([torch.linspace(-60, 12, 2001), torch.tensor([-1e9, -1e4, -30.0, 0.0, 40.0])]).to(
+        dtype
+    )
     found = LogNormal.apply(values.requires_grad_())
     (slope,) = torch.autograd.grad(found.sum(), values)
     x = values.detach().double().numpy()
@@ -254,8 +262,14 @@ def test_probabilities_sum_to_one_and_other_values_have_none(kind):
     each = torch.stack([emission.log_density(action.expand(2, 3, size)).exp() for action in every])
     torch.testing.assert_close(each.sum(0), torch.ones_like(each[0]))
     for k in range(2):
-        assert torch.equal(emission.log_density(emission.mode[..., k, :])[..., k].exp(), each.max(0)[0][..., k])
-    for other in (torch.full((2, 3, size), 0.5), torch.full((2, 3, size), -1.0), torch.full((2, 3, size), 7.0)):
+        assert torch.equal(
+            emission.log_density(emission.mode[..., k, :])[..., k].exp(), each.max(0)[0][..., k]
+        )
+    for other in (
+        torch.full((2, 3, size), 0.5),
+        torch.full((2, 3, size), -1.0),
+        torch.full((2, 3, size), 7.0),
+    ):
         assert (emission.log_density(other.double()) == -INF).all()
 
 
@@ -291,7 +305,9 @@ def test_divergences_are_those_of_torch(kind):
     else:
         p, q = (distributions.Categorical(logits=emission.logits[..., k, :]) for k in (0, 1))
     both = 0.5 * (distributions.kl_divergence(p, q) + distributions.kl_divergence(q, p))
-    torch.testing.assert_close(emission.divergence(0)[..., 1], both if kind == "categorical" else both.sum(-1))
+    torch.testing.assert_close(
+        emission.divergence(0)[..., 1], both if kind == "categorical" else both.sum(-1)
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)

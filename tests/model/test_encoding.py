@@ -32,7 +32,9 @@ def make_demonstrations():
             "grid": random.normal(2, 5, (steps, 2, 2)),
             "camera": random.integers(0, 256, (steps, 6, 4, 3), dtype=np.uint8),
         }
-        actions = np.column_stack([random.normal(40, 9, steps), np.full(steps, 2.5), random.normal(0, 1e-3, steps)])
+        actions = np.column_stack(
+            [random.normal(40, 9, steps), np.full(steps, 2.5), random.normal(0, 1e-3, steps)]
+        )
         records.append(Demonstration(f"demo_{number}", observations, actions))
     return Demonstrations(tuple(records))
 
@@ -70,8 +72,8 @@ def test_features_are_standardised_with_differences_behind_their_observation():
 
 @pytest.mark.parametrize("key", ["pose", "grid"])
 def test_bins_add_up_to_quantiles(key):
-    """How far each number has come through all of its parts together is scikit-learn's quantile transform, where
-    quantiles are values that there are.
+    """How far each number has come through all of its parts together is scikit-learn's quantile transform,
+    where quantiles are values that there are.
     """
     bins, raw = sum(LENGTHS) - 1, rows(key)
     encoder = fitted(ObservationSpec(key=key, bins=bins))
@@ -86,7 +88,9 @@ def test_bins_add_up_to_quantiles(key):
     expected[:, np.ptp(raw, axis=0) == 0] = 0  # it never changes
     np.testing.assert_allclose(through.reshape(len(raw), bins, width).mean(1), expected, atol=1e-5)
     np.testing.assert_allclose(seen.mean(0), 0, atol=1e-5)
-    np.testing.assert_allclose(seen.std(0), np.where(np.tile(np.ptp(raw, axis=0) > 0, 1 + bins), 1, 0), atol=1e-5)
+    np.testing.assert_allclose(
+        seen.std(0), np.where(np.tile(np.ptp(raw, axis=0) > 0, 1 + bins), 1, 0), atol=1e-5
+    )
 
 
 def test_a_value_that_most_steps_have_is_one_value_of_a_part():
@@ -153,5 +157,7 @@ def test_the_density_is_in_the_controls_own_units():
         found = log_likelihood(hierarchy.tabulate(encoded), encoded.lengths)
         mean = hierarchy.scaling.emitted(hierarchy(encoded.inputs).emissions[0].mean[:, :, 0])
     std = 0.2 * hierarchy.scaling.scale.numpy()
-    expected = [stats.norm.logpdf(demo.actions, mean[n, : len(demo)], std).sum() for n, demo in enumerate(DEMOS)]
+    expected = [
+        stats.norm.logpdf(demo.actions, mean[n, : len(demo)], std).sum() for n, demo in enumerate(DEMOS)
+    ]
     np.testing.assert_allclose(found, expected, rtol=1e-4)

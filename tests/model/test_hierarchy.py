@@ -16,7 +16,9 @@ def test_gradient_is_the_papers_gradient_equation(emits):
     """∇L of §4.1 (and its hybrid terms, §4.2) with u, v, w summed over every path, against autograd."""
     hierarchy, batch = make_hierarchy((3,), emits).double(), make_batch()
     batch = Batch(
-        Inputs({"state": batch.inputs.vector.double()}, {}, batch.inputs.time), batch.actions.double(), batch.lengths
+        Inputs({"state": batch.inputs.vector.double()}, {}, batch.inputs.time),
+        batch.actions.double(),
+        batch.lengths,
     )
     parameters = list(hierarchy.parameters())
     tables = hierarchy.tabulate(batch)
@@ -28,7 +30,9 @@ def test_gradient_is_the_papers_gradient_equation(emits):
         eta, pi, psi = tables.selection[0][n, :length, 0], tables.control[0][n], tables.termination[0][n]
         surrogate = surrogate + (v[:, 1:] * eta[:, 1:]).sum() + (u[:, 1:] * pi[:length]).sum()
         surrogate = (
-            surrogate + ((u - w)[:-1, 1:] * psi[1:length, :, 1]).sum() + (w[:-1, 1:] * psi[1:length, :, 0]).sum()
+            surrogate
+            + ((u - w)[:-1, 1:] * psi[1:length, :, 1]).sum()
+            + (w[:-1, 1:] * psi[1:length, :, 0]).sum()
         )
         if "control" in emits:
             surrogate = surrogate + (v[:, 0] * (eta[:, 0] + tables.control[1][n, :length, 0])).sum()
@@ -80,7 +84,9 @@ def test_controls_that_want_a_gradient_get_it():
     batch = make_batch()
     tables = make_hierarchy((2,))(batch.inputs).tables(batch.actions.requires_grad_())
     found, expected = (
-        torch.autograd.grad(log_likelihood(tables, batch.lengths, engine).sum(), batch.actions, retain_graph=True)[0]
+        torch.autograd.grad(
+            log_likelihood(tables, batch.lengths, engine).sum(), batch.actions, retain_graph=True
+        )[0]
         for engine in ("fused", "enumerate")
     )
     assert found.abs().max() > 0.1

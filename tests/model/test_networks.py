@@ -23,7 +23,8 @@ from ddco_pyro.model.networks.conv import POOLED
 
 
 @pytest.mark.parametrize(
-    "settings", [{"network": "linear"}, {"network": "constant"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}]
+    "settings",
+    [{"network": "linear"}, {"network": "constant"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}],
 )
 def test_stacked_networks_are_separate_networks(settings):
     network, inputs = make(**settings), make_inputs()
@@ -37,7 +38,10 @@ CONVOLUTION = [{"filters": 3, "kernel": 5, "stride": 2, "padding": 2}]
 
 def test_a_standardised_picture_is_seen_whatever_its_brightness_and_contrast():
     """As numpy standardises it; half as strong and darker or brighter it gives the same."""
-    shape, settings = InputShape({}, {"camera": PIXELS}), {"network": "conv", "layers": CONVOLUTION, "pool": "flatten"}
+    shape, settings = (
+        InputShape({}, {"camera": PIXELS}),
+        {"network": "conv", "layers": CONVOLUTION, "pool": "flatten"},
+    )
     plain, network = make(shape, **settings), make(shape, **settings, standardize=True)
     network.load_state_dict(plain.state_dict())
     picture = 2 * torch.randint(0, 64, (1, 1, *PIXELS), dtype=torch.uint8)
@@ -59,7 +63,7 @@ def test_a_picture_of_one_colour_is_standardised_to_nothing():
     assert gradient.isfinite().all()
 
 
-# --- per-timestep -----------------------------------------------------------------------------------------------------
+# --- per-timestep -------------------------------------------------------------------------------------------
 
 
 def one_at_a_time(network, inputs):
@@ -81,7 +85,7 @@ def test_every_step_has_its_own_network(steps, start):
     assert_close(network(inputs)[0], one_at_a_time(network, inputs))
 
 
-# --- images -----------------------------------------------------------------------------------------------------------
+# --- images -------------------------------------------------------------------------------------------------
 
 
 def separate_conv(network, k, inputs):
@@ -123,7 +127,8 @@ ACTIVATIONS = {"relu": nn.ReLU(), "leaky_relu": nn.LeakyReLU(0.01), "elu": nn.EL
 
 
 @pytest.mark.parametrize(
-    ("pool", "activation"), [("mean", "relu"), ("flatten", "leaky_relu"), ("spatial_softmax", "elu"), ("mean", "tanh")]
+    ("pool", "activation"),
+    [("mean", "relu"), ("flatten", "leaky_relu"), ("spatial_softmax", "elu"), ("mean", "tanh")],
 )
 def test_several_convolutions_are_separate_networks(pool, activation):
     """The activation follows every convolution and every hidden layer."""
@@ -146,7 +151,9 @@ def test_branches_read_each_their_own_and_are_joined():
     shape = InputShape({"pose": 2, "goal": 3, "other": 4}, {"camera": PIXELS})
     pair = {"network": "linear", "inputs": ["goal", "pose"]}
     picture = {"network": "conv", "layers": CONVOLUTION, "hidden": [6]}
-    network = make(shape, network="branches", of={"camera": picture, "pair": pair, "goal": {"hidden": [5]}}, hidden=[8])
+    network = make(
+        shape, network="branches", of={"camera": picture, "pair": pair, "goal": {"hidden": [5]}}, hidden=[8]
+    )
     inputs = random_inputs(shape, 2, LONGEST, 0)
     seen = Inputs({}, inputs.images, inputs.time)
     camera, _, goal = network.of
@@ -161,7 +168,7 @@ def test_branches_read_each_their_own_and_are_joined():
     assert_close(answer(network, inputs)[0], torch.stack(expected, dim=2))
 
 
-# --- some of the observations -----------------------------------------------------------------------------------------
+# --- some of the observations -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("settings", [{"network": "linear"}, {"network": "user_networks:Own"}])
@@ -180,7 +187,7 @@ def test_all_vectors_are_read_in_the_order_of_the_spec():
     assert_close(network(inputs)[0], expected)
 
 
-# --- a user's own -----------------------------------------------------------------------------------------------------
+# --- a user's own -------------------------------------------------------------------------------------------
 
 
 def test_a_network_of_ones_own():
@@ -189,7 +196,9 @@ def test_a_network_of_ones_own():
 
 
 def test_another_network_reads_as_many_of_its_numbers_as_its_class_says():
-    over = [make(network="lstm", over={"network": f"user_networks:{name}"}).over for name in ("Own", "Narrow")]
+    over = [
+        make(network="lstm", over={"network": f"user_networks:{name}"}).over for name in ("Own", "Narrow")
+    ]
     assert [network.features for network in over] == [64, 5]
 
 
@@ -197,7 +206,15 @@ SHOULD = "it has to be a tensor [N, T, copies, outputs], here"
 STATE = "has initial_state(N), which has to give a tuple of tensors [N, ...]; each call"
 BY_STEPS = "gives other outputs step by step than for a whole trajectory: its state has to hold all"
 ALONE = "gives a step alone other outputs than within its trajectory: it depends on earlier steps"
-MEMORIES = ["over time", "over trajectories", "differences", "later steps", "whole trajectory", "whole batch", "chance"]
+MEMORIES = [
+    "over time",
+    "over trajectories",
+    "differences",
+    "later steps",
+    "whole trajectory",
+    "whole batch",
+    "chance",
+]
 
 
 @pytest.mark.parametrize(
@@ -223,16 +240,28 @@ def test_a_network_of_ones_own_is_tried_when_it_is_made(network, how, message):
 @pytest.mark.parametrize(
     ("shape", "settings", "message"),
     [
-        (InputShape({"state": 3}, {"camera": PIXELS}), {"network": "linear"}, "reads vectors, but camera are images"),
+        (
+            InputShape({"state": 3}, {"camera": PIXELS}),
+            {"network": "linear"},
+            "reads vectors, but camera are images",
+        ),
         (SHAPE, {"network": "conv"}, "needs an image among the observations"),
-        (SHAPE, {"network": "branches", "of": {"camera": {"network": "conv"}}}, "^of.camera: inputs: there is no"),
+        (
+            SHAPE,
+            {"network": "branches", "of": {"camera": {"network": "conv"}}},
+            "^of.camera: inputs: there is no",
+        ),
         (SHAPE, {"inputs": ["stat"]}, r"no observation 'stat' \(did you mean 'state'\?\); there is: state"),
         (
             InputShape({}, {"camera": (6, 6, 3)}),
             {"network": "conv", "layers": [{"filters": 2, "kernel": 5}, {"filters": 2, "kernel": 3}]},
             "camera of 6 × 6 is too small for its layers",
         ),
-        (SHAPE, {"network": "no_such_module:Net"}, "'no_such_module:Net' cannot be imported: No module named"),
+        (
+            SHAPE,
+            {"network": "no_such_module:Net"},
+            "'no_such_module:Net' cannot be imported: No module named",
+        ),
         (SHAPE, {"network": "user_networks:NotANetwork"}, "is not a torch.nn.Module class"),
         (SHAPE, {"network": "user_networks:Own", "options": {"gain": -1}}, "the gain has to be positive"),
     ],

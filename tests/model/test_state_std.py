@@ -56,7 +56,9 @@ def test_at_first_it_is_the_same_everywhere(network):
     for caller in hierarchy(batch.inputs).callers[:1]:
         torch.testing.assert_close(caller.emission.std, torch.full((*batch.inputs.batch, 2, 2), INITIAL_STD))
         assert caller.emission.mean.std() > 0.01
-        gradient = torch.autograd.grad(caller.log_density(batch.actions).sum(), hierarchy.levels[0].policy.parameters())
+        gradient = torch.autograd.grad(
+            caller.log_density(batch.actions).sum(), hierarchy.levels[0].policy.parameters()
+        )
         assert all((slope != 0).any() for slope in gradient if slope.shape[-1] == 4)
 
 
@@ -76,7 +78,8 @@ def test_dimensions_with_other_sigmas_stand_beside():
 
 
 def noisy(number=40, steps=25):
-    """Controls around a linear policy, with a spread of 0.05 + softplus(2.5 s_0 - 1); and their log-densities.
+    """Controls around a linear policy, with a spread of 0.05 + softplus(2.5 s_0 - 1); and their
+    log-densities.
 
     One policy does all of it: there is no skill.
     """
@@ -115,7 +118,9 @@ def test_a_planted_sigma_of_the_state_is_found(fitted):
     names = [row.name for row in fit.metrics.valid]
     found = fit.metrics.log_likelihood_per_step.valid
     assert found == pytest.approx(np.mean([truth[name] for name in names]), abs=0.02)
-    train, valid = ([demo for demo in demos if (demo.name in names) == held_out] for held_out in (False, True))
+    train, valid = (
+        [demo for demo in demos if (demo.name in names) == held_out] for held_out in (False, True)
+    )
     seen, actions = zip(*(_rows(part) for part in (train, valid)), strict=True)
     weights = np.linalg.lstsq(seen[0], actions[0], rcond=None)[0]
     std = (actions[0] - seen[0] @ weights).std(0)

@@ -49,6 +49,12 @@ def test_it_is_what_each_would_give_with_these_weights_and_learns_from_all():
 def test_it_is_trained_with_the_lowest_level_and_with_all():
     spec = spec_of(LINEAR, SEES, layerwise=True)
     names = [name for name, _ in made(spec).named_parameters()]
-    trained = {stage.name: [name for name in names if name.startswith(stage.trained)] for stage in plan(spec, 2)}
-    assert [name for name, own in trained.items() if "trunk.layers.0.weight" in own] == ["vq-1", "level-1", "joint"]
+    trained = {
+        stage.name: [name for name in names if name.startswith(stage.trained)] for stage in plan(spec, 2)
+    }
+    assert [name for name, own in trained.items() if "trunk.layers.0.weight" in own] == [
+        "vq-1",
+        "level-1",
+        "joint",
+    ]
     assert trained["joint"] == [name for name in names if not name.startswith(("encoder.", "scaling."))]

@@ -40,7 +40,9 @@ def test_transitions_are_those_counted_by_hand():
     expected[1, 2], expected[2, 3], expected[2, 1] = 2, 1, 1
     expected[3, 4], expected[2, 4], expected[1, 4] = 1, 1, 1
     np.testing.assert_array_equal(counts, expected)
-    drawn = transition_graph(counts, [0, 7 / 17, 8 / 17, 2 / 17], ["control", "a<b", "place", "go"], [1, 2, 3])
+    drawn = transition_graph(
+        counts, [0, 7 / 17, 8 / 17, 2 / 17], ["control", "a<b", "place", "go"], [1, 2, 3]
+    )
     titles = re.findall(r"<title>([^<]*): (\d+) of (\d+)</title>", drawn)
     assert {(name, int(a), int(b)) for name, a, b in titles} == {
         ("start → a&lt;b", 2, 3), ("start → place", 1, 3), ("a&lt;b → place", 2, 3), ("place → go", 1, 3),
@@ -150,7 +152,8 @@ def test_the_border_has_the_colour_of_the_active_option(episode):
     assert (episode.frames[0] == 0).all()  # the episode's own frames stay as they are
 
 
-# What people without red, green or blue cones see, in linear RGB (Machado, Oliveira & Fernandes 2009, severity 1).
+# What people without red, green or blue cones see, in linear RGB (Machado, Oliveira & Fernandes 2009,
+# severity 1).
 SIGHTS = np.array([
     [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],

@@ -47,7 +47,10 @@ class Planted:
         rng = np.random.default_rng(0)
         demos = []
         for number, options in enumerate(self.options):
-            seen = {"arm/joints": rng.normal(size=(len(options), 3)), "jaw": rng.normal(size=(len(options), 1))}
+            seen = {
+                "arm/joints": rng.normal(size=(len(options), 3)),
+                "jaw": rng.normal(size=(len(options), 1)),
+            }
             demos.append(Demonstration(f"demo_{number}", seen, rng.normal(size=(len(options), 2))))
         self.demos = Demonstrations(tuple(demos), attributes={"control_frequency": frequency})
         self.demos.write(self.file)
@@ -86,7 +89,7 @@ def planted(tmp_path):
     return Planted(tmp_path, ORDERED)
 
 
-# --- MimicGen and Isaac Lab Mimic -------------------------------------------------------------------------------------
+# --- MimicGen and Isaac Lab Mimic ---------------------------------------------------------------------------
 
 PREPARED = {
     "--mimicgen": ("datagen_info", ("eef_pose", "object_poses/cube", "target_pose", "gripper_action")),
@@ -109,15 +112,17 @@ def prepare(planted, kind):
 def arrays(group):
     """Every dataset below a group, by name."""
     found = {}
-    group.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+    group.visititems(
+        lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {})
+    )
     return found
 
 
 def spans(signals, subtasks, steps):
     """Subtasks as (start, stop), as MimicGen's documentation of termination signals defines them.
 
-    A subtask ends with the step where its signal goes from 0 to 1 for the first time; the last one ends with the
-    demonstration.
+    A subtask ends with the step where its signal goes from 0 to 1 for the first time; the last one ends with
+    the demonstration.
     """
     stops = []
     for name in subtasks[:-1]:
@@ -185,7 +190,7 @@ def test_ends_that_no_signal_can_mark_are_refused(tmp_path, plan, message):
     assert not (tmp_path / "copy.hdf5").exists()
 
 
-# --- LeRobot ----------------------------------------------------------------------------------------------------------
+# --- LeRobot ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -197,7 +202,11 @@ def test_annotations_are_imported_as_labels_with_names(dataset, tmp_path):
     """As the page on which LeRobot's users label keeps them, for some episodes."""
     atom = {"role": "assistant", "style": "subtask", "tool_calls": None}
     memory = {"role": "assistant", "style": "memory", "content": "seen", "timestamp": 0.0}
-    atoms = [{**atom, "content": "lift it", "timestamp": 0.3}, memory, {**atom, "content": "go", "timestamp": 0.1}]
+    atoms = [
+        {**atom, "content": "lift it", "timestamp": 0.3},
+        memory,
+        {**atom, "content": "go", "timestamp": 0.1},
+    ]
     annotations = {"version": 2, "schema": {}, "episodes": {"0": {"atoms": atoms}, "2": {"atoms": []}}}
     (dataset / "meta" / "lerobot_annotations.json").write_text(json.dumps(annotations))
     import_demonstrations(dataset, tmp_path / "imported.hdf5")
@@ -227,7 +236,9 @@ def test_the_stages_of_sarm(tmp_path):
     out = planted.write("--sarm", "dataset", demos=LEROBOT)
     rows = parquet.read_table(next((out / "meta" / "episodes").rglob("*.parquet"))).to_pylist()
     for number, row in enumerate(rows):
-        stages = zip(*(row[f"dense_subtask_{key}"] for key in ("names", "start_frames", "end_frames")), strict=True)
+        stages = zip(
+            *(row[f"dense_subtask_{key}"] for key in ("names", "start_frames", "end_frames")), strict=True
+        )
         assert [(name, start, end + 1) for name, start, end in stages] == planted.runs(number)
     shares = json.loads((out / "meta" / "temporal_proportions_dense.json").read_text())
     assert list(shares) == ["reach", "grasp", "place"]
@@ -244,14 +255,17 @@ def test_a_copy_of_a_dataset_gets_stages_beside_its_subtasks(tmp_path):
     assert (second / "meta" / "lerobot_annotations.json").read_text() == (
         first / "meta" / "lerobot_annotations.json"
     ).read_text()
-    names = [parquet.read_schema(next((one / "meta" / "episodes").rglob("*.parquet"))).names for one in (second, third)]
+    names = [
+        parquet.read_schema(next((one / "meta" / "episodes").rglob("*.parquet"))).names
+        for one in (second, third)
+    ]
     assert names[0] == names[1]
     (tmp_path / "taken").mkdir()
     with pytest.raises(BadInput, match="taken: exists; remove it, or choose another --sarm"):
         planted.write("--sarm", "taken", demos=first)
 
 
-# --- annotation tools -------------------------------------------------------------------------------------------------
+# --- annotation tools ---------------------------------------------------------------------------------------
 
 
 def test_predictions_for_label_studio(planted):
@@ -285,7 +299,7 @@ def test_annotations_for_elan(planted):
         assert found == [(name, 50 * start, 50 * stop) for name, start, stop in planted.runs(number)]  # 20 Hz
 
 
-# --- the tools themselves ---------------------------------------------------------------------------------------------
+# --- the tools themselves -----------------------------------------------------------------------------------
 
 TOOLS = Path(os.environ.get("DDCO_PYRO_TOOLS", HERE.parent / ".venv-tools")) / "bin" / "python"
 """``make tools`` makes this environment."""
@@ -336,11 +350,16 @@ def test_a_policy_for_lerobot_is_an_export_with_lerobots_files(toy_run, tmp_path
     done("export", toy_run.folder, "--lerobot", tmp_path / "policy")
     done("export", toy_run.folder, "--out", tmp_path / "export")
     exported, policy = (
-        {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("export", "policy")
+        {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()}
+        for name in ("export", "policy")
     )
     for name in ("controller.json", "runner.py"):
         assert policy[name] == exported[name]
-    assert policy.keys() - exported.keys() == {"config.json", "policy_preprocessor.json", "policy_postprocessor.json"}
+    assert policy.keys() - exported.keys() == {
+        "config.json",
+        "policy_preprocessor.json",
+        "policy_postprocessor.json",
+    }
     config = json.loads(policy["config.json"])
     assert config["type"] == "ddco"
     assert config["input_features"]["observation.offsets"] == {"type": "STATE", "shape": [4]}

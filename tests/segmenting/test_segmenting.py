@@ -75,10 +75,16 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--level", "option"], "name what to write, such as --html PAGE or --csv FILE; labels for each step go to"),
+        (
+            ["--level", "option"],
+            "name what to write, such as --html PAGE or --csv FILE; labels for each step go to",
+        ),
         (["--in-place", "--out", "copy.hdf5"], "--out and --in-place exclude each other; keep one"),
         (["--mimicgen", "copy.hdf5"], "demo_0: has no datagen_info/eef_pose"),
-        (["--sarm", "copy"], "demos.hdf5: is no LeRobot dataset, which --sarm needs; name another format, such as"),
+        (
+            ["--sarm", "copy"],
+            "demos.hdf5: is no LeRobot dataset, which --sarm needs; name another format, such as",
+        ),
     ],
 )
 def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
@@ -130,7 +136,7 @@ def test_tables_have_a_row_for_each_step(toy_run, written):
     assert [{key: str(value) for key, value in row.items()} for row in binary] == rows
 
 
-# --- the page ---------------------------------------------------------------------------------------------------------
+# --- the page -----------------------------------------------------------------------------------------------
 
 
 def test_the_page_shows_every_segment(toy_run, written):
@@ -162,12 +168,20 @@ def test_intervals_are_those_of_the_posterior_draws(toy_run, file):
         assert level.intervals.shape == (len(starts), 2)
         assert level.intervals[0].tolist() == [0, 0]
         ((options,), (ended,)) = piece.draws(row, 100, (0, len(demo)))
-        for place, (before, start, after) in enumerate(zip(starts, starts[1:], [*starts[2:], len(demo)], strict=False)):
+        for place, (before, start, after) in enumerate(
+            zip(starts, starts[1:], [*starts[2:], len(demo)], strict=False)
+        ):
             a, b = level.options[start - 1], level.options[start]
             at = [
                 min(steps, key=lambda step: (abs(step - start), step))
                 for path, new in zip(options, ended, strict=True)
-                if (steps := [t for t in range(before + 1, after) if path[t - 1] == a and path[t] == b and new[t] == 1])
+                if (
+                    steps := [
+                        t
+                        for t in range(before + 1, after)
+                        if path[t - 1] == a and path[t] == b and new[t] == 1
+                    ]
+                )
             ]
             low, high = level.intervals[place + 1]
             within = np.mean([low <= step <= high for step in at]) if at else 1.0
@@ -190,7 +204,9 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     for name, part in split.items():
         (path,) = toy_run.segment(part)
         found = np.concatenate(path)
-        scores[name] = normalized_mutual_info_score(np.concatenate([demo.labels["phase"] for demo in part]), found)
+        scores[name] = normalized_mutual_info_score(
+            np.concatenate([demo.labels["phase"] for demo in part]), found
+        )
     assert "Agreement with the label “phase”" in text
     assert f"<td>options, 3 held out</td><td>{scores['valid']:.2f}</td>" in text
     assert f"<td>options, 9 others</td><td>{scores['train']:.2f}</td>" in text
@@ -221,14 +237,24 @@ def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
     assert not re.search("<img|<b>", without_code)
 
 
-# --- what cannot be segmented -----------------------------------------------------------------------------------------
+# --- what cannot be segmented -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("key", "other", "width", "message"),
     [
-        ("obs/offsets", "obs/offsets", 3, "obs/offsets has shape (3,) at each step, the run was fitted to (4,)"),
-        ("obs/offsets", "obs/offset", 4, "there is no observation 'offsets' (did you mean 'offset'?), which the run"),
+        (
+            "obs/offsets",
+            "obs/offsets",
+            3,
+            "obs/offsets has shape (3,) at each step, the run was fitted to (4,)",
+        ),
+        (
+            "obs/offsets",
+            "obs/offset",
+            4,
+            "there is no observation 'offsets' (did you mean 'offset'?), which the run",
+        ),
         ("actions", "actions", 1, "actions has shape (1,) at each step, the run was fitted to (2,)"),
     ],
 )
@@ -246,7 +272,7 @@ def test_a_policy_without_options_is_refused(toy_run, file):
     refused(message, "segment", toy_run.folder / "baselines" / "flat", file, "--in-place")
 
 
-# --- subtasks of LeRobot datasets -------------------------------------------------------------------------------------
+# --- subtasks of LeRobot datasets ---------------------------------------------------------------------------
 
 
 LEROBOT = Path(__file__).parents[1] / "fixtures" / "lerobot"
@@ -280,10 +306,18 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
 
     ``fixtures/read_formats.py`` has LeRobot read what is written here; 0.6.1 did.
     """
-    options = {int(key): np.array(value) for key, value in json.loads((LANGUAGE / "options.json").read_text()).items()}
-    level = {key: LevelLabels(value, np.ones(len(value), bool), np.ones(len(value))) for key, value in options.items()}
+    options = {
+        int(key): np.array(value)
+        for key, value in json.loads((LANGUAGE / "options.json").read_text()).items()
+    }
+    level = {
+        key: LevelLabels(value, np.ones(len(value), bool), np.ones(len(value)))
+        for key, value in options.items()
+    }
     found = Segmented(
-        tuple(Segments(f"demo_{key}", {"skill": one}, 0.0, False) for key, one in level.items()), {"skill": 2}, 10.0
+        tuple(Segments(f"demo_{key}", {"skill": one}, 0.0, False) for key, one in level.items()),
+        {"skill": 2},
+        10.0,
     )
     with open_source(LEROBOT) as source:
         fit = SimpleNamespace(names={"skill": ("control", "option 1", "option 2")})
@@ -295,7 +329,12 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
     ours, theirs = (json.loads(path.read_text())["features"] for path in infos)
     assert ours == theirs
     frames = parquet.ParquetFile(next((tmp_path / "out" / "data").rglob("*.parquet")))
-    assert [frames.metadata.row_group(group).num_rows for group in range(frames.num_row_groups)] == [5, 6, 7, 8]
+    assert [frames.metadata.row_group(group).num_rows for group in range(frames.num_row_groups)] == [
+        5,
+        6,
+        7,
+        8,
+    ]
 
 
 def test_a_copy_with_subtasks(lerobot_run, tmp_path):

@@ -37,7 +37,9 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
         rest = demos.select([name for name in demos.names if name not in names])
         trained = train_model(row.candidate.spec, Dimensions.of(demos), rest)
         expected = Fit(row.candidate.spec, trained.hierarchy).log_likelihood(demos.select(names))
-        np.testing.assert_array_equal([demo.log_likelihood for demo in scores[row.candidate.number, 2].valid], expected)
+        np.testing.assert_array_equal(
+            [demo.log_likelihood for demo in scores[row.candidate.number, 2].valid], expected
+        )
 
 
 def test_every_candidate_has_the_same_folds(finished):
@@ -46,7 +48,9 @@ def test_every_candidate_has_the_same_folds(finished):
     assert set(scores) == {(c, f) for c in range(2) for f in range(3)}
     for (_, fold), one in scores.items():
         assert tuple(demo.name for demo in one.valid) == tuple(made.held_out[fold])
-        assert [demo.steps for demo in one.valid] == [len(demo) for demo in two_skills().select(made.held_out[fold])]
+        assert [demo.steps for demo in one.valid] == [
+            len(demo) for demo in two_skills().select(made.held_out[fold])
+        ]
     assert told.begun == [("cross-validation", 6, 0)]
     assert {pair[0] for pair in told.pairs} == {
         f"{row.candidate.name}, fold {f}" for row in made.choice.rows for f in range(3)

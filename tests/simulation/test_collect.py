@@ -101,7 +101,7 @@ def test_an_unknown_supervisor_is_refused_in_one_line():
         collect(TASK, DemonstrationsSpec(supervisor="expert"))
 
 
-# --- which demonstrations a spec means --------------------------------------------------------------------------------
+# --- which demonstrations a spec means ----------------------------------------------------------------------
 
 
 SIZE = Dimensions({"offsets": (4,), "camera": (8, 8, 3), "visited": (1,)}, control_size=2, steps=12)
@@ -115,14 +115,18 @@ def spec(**changes):
 @pytest.fixture
 def path(tmp_path):
     records = [
-        Demonstration(f"demo_{n}", {"offsets": np.zeros((n, 7))}, np.arange(3.0 * n).reshape(n, 3)) for n in (4, 9)
+        Demonstration(f"demo_{n}", {"offsets": np.zeros((n, 7))}, np.arange(3.0 * n).reshape(n, 3))
+        for n in (4, 9)
     ]
     Demonstrations(tuple(records)).write(tmp_path / "demos.hdf5")
     return tmp_path / "demos.hdf5"
 
 
 def test_dimensions_come_from_the_file(path):
-    for given in (spec(demonstrations={"path": str(path)}), spec(task=None, demonstrations={"path": str(path)})):
+    for given in (
+        spec(demonstrations={"path": str(path)}),
+        spec(task=None, demonstrations={"path": str(path)}),
+    ):
         assert dimensions(given) == Dimensions({"offsets": (7,)}, 3, 9)
 
 
@@ -152,7 +156,9 @@ def test_demonstrations_can_be_left_out(path):
     left = spec(demonstrations={"path": str(path), "exclude": ["demo_4"]})
     found = demonstrations(left)
     assert (found.names, dict(found.masks)) == (("demo_9",), {"valid": ("demo_9",)})
-    with pytest.raises(DemonstrationsError, match=r"demo_4: actions is nan at step 2, index \[0\]; repair it, or"):
+    with pytest.raises(
+        DemonstrationsError, match=r"demo_4: actions is nan at step 2, index \[0\]; repair it, or"
+    ):
         demonstrations(spec(demonstrations={"path": str(path)}))
 
 
@@ -173,7 +179,10 @@ def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
     path, told = tmp_path / "later.hdf5", []
     given = spec(demonstrations={"path": str(path), "count": 3, "labels": "phase"})
     found = demonstrations(given, told.append)
-    assert (found.names, told[-1]) == (("demo_0", "demo_1", "demo_2"), Counted("collecting demonstrations", 3, done=3))
+    assert (found.names, told[-1]) == (
+        ("demo_0", "demo_1", "demo_2"),
+        Counted("collecting demonstrations", 3, done=3),
+    )
     assert (set(found[0].observations), set(found[0].labels)) == ({"offsets"}, {"phase"})
     assert path.exists()
 
@@ -198,17 +207,32 @@ def own(options):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"observations": ["offsets", "pose", "jaw"]}, r"^observations: there is no pose, jaw \(there are: camera, of"),
-        ({"observations": ["visited"], "report": {"trajectory": "visited"}}, r"^report\.trajectory: 'visited' is 1"),
-        ({"report": {"trajectory": ["offsets", "3:9"]}}, r"^report\.trajectory: 'offsets\[3:9\]' is 1 numbers, of"),
-        ({"report": {"trajectory": ["offsets", "0:4"]}}, r"^report\.trajectory: 'offsets\[0:4\]' is 4 numbers, of"),
+        (
+            {"observations": ["offsets", "pose", "jaw"]},
+            r"^observations: there is no pose, jaw \(there are: camera, of",
+        ),
+        (
+            {"observations": ["visited"], "report": {"trajectory": "visited"}},
+            r"^report\.trajectory: 'visited' is 1",
+        ),
+        (
+            {"report": {"trajectory": ["offsets", "3:9"]}},
+            r"^report\.trajectory: 'offsets\[3:9\]' is 1 numbers, of",
+        ),
+        (
+            {"report": {"trajectory": ["offsets", "0:4"]}},
+            r"^report\.trajectory: 'offsets\[0:4\]' is 4 numbers, of",
+        ),
         (
             {"report": {"trajectory": [["offsets", "0:3"], ["offsets", "2:4"]]}},
             r"^report\.trajectory: offsets\[2:4\] is in the plane, offsets\[0:3\] in space; name as many",
         ),
         ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
         (
-            {"baseline": None, "hierarchy": {"levels": [LEVEL, LEVEL | {"name": "task", "termination": CONV}]}},
+            {
+                "baseline": None,
+                "hierarchy": {"levels": [LEVEL, LEVEL | {"name": "task", "termination": CONV}]},
+            },
             r"^hierarchy\.levels\.1\.termination: needs an image",
         ),
         (
@@ -236,11 +260,19 @@ def test_a_spec_that_does_not_fit_says_where(changes, message):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"hierarchy.levels.0.policy.hidden": [10**6, 10**6]}, r"the networks have \d+ parameters, more than 50000000"),
-        ({"hierarchy.levels.0.policy.hidden": [10**30]}, "the networks have more parameters than a machine can count"),
+        (
+            {"hierarchy.levels.0.policy.hidden": [10**6, 10**6]},
+            r"the networks have \d+ parameters, more than 50000000",
+        ),
+        (
+            {"hierarchy.levels.0.policy.hidden": [10**30]},
+            "the networks have more parameters than a machine can count",
+        ),
         ({"hierarchy.levels.0.count": 10**9}, "the levels have 1000000001 joint choices, at most 10000"),
     ],
 )
 def test_a_model_that_fills_the_memory_is_refused_before_it_is_made(toy_spec, overrides, message):
     with pytest.raises(SpecError, match=message):
-        check_networks(with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))
+        check_networks(
+            with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12)
+        )

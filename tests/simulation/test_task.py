@@ -39,7 +39,10 @@ def test_a_registered_task_whose_packages_are_missing_is_one_line(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("no_such_module:task", "^task 'no_such_module:task' cannot be loaded: No module named 'no_such_module'$"),
+        (
+            "no_such_module:task",
+            "^task 'no_such_module:task' cannot be loaded: No module named 'no_such_module'$",
+        ),
         ("toy_task:missing", "^task 'toy_task:missing' cannot be loaded: .*has no attribute 'missing'$"),
         (":task", "^task ':task' cannot be loaded: invalid format: ':task'$"),
         ("toy_task:SPEC", r"leads to a str, not to a ddco_pyro\.simulation\.task\.Task$"),
@@ -57,8 +60,16 @@ def with_outcome(outcome, **measures):
 @pytest.mark.parametrize(
     ("outcome", "measures", "message"),
     [
-        ({"success": 0.5}, {}, r"^task 'toy': success is 0\.5, and a rate is 0 or 1 in every episode; make it a"),
-        ({"done": 2.0}, {"done": "rate"}, r"^task 'toy': done is 2, and a rate is 0 or 1 in every episode; make it a"),
+        (
+            {"success": 0.5},
+            {},
+            r"^task 'toy': success is 0\.5, and a rate is 0 or 1 in every episode; make it a",
+        ),
+        (
+            {"done": 2.0},
+            {"done": "rate"},
+            r"^task 'toy': done is 2, and a rate is 0 or 1 in every episode; make it a",
+        ),
         (
             {"success": 1.0, "topples": 2.0},
             {"success": "rate", "topple": "mean"},
@@ -77,8 +88,14 @@ def test_an_outcome_that_is_not_what_was_declared_is_refused(outcome, measures, 
 @pytest.mark.parametrize(
     ("measures", "message"),
     [
-        ({"success": "mean"}, "task 'toy': success is a rate, by which methods are compared; call the mean otherwise"),
-        ({"topples": "count"}, "task 'toy': topples is declared a 'count'; it has to be a 'rate' or a 'mean'"),
+        (
+            {"success": "mean"},
+            "task 'toy': success is a rate, by which methods are compared; call the mean otherwise",
+        ),
+        (
+            {"topples": "count"},
+            "task 'toy': topples is declared a 'count'; it has to be a 'rate' or a 'mean'",
+        ),
     ],
 )
 def test_a_wrong_declaration_is_refused(measures, message):
@@ -87,7 +104,7 @@ def test_a_wrong_declaration_is_refused(measures, message):
     assert str(caught.value) == message
 
 
-# --- Gymnasium environments as tasks ----------------------------------------------------------------------------------
+# --- Gymnasium environments as tasks ------------------------------------------------------------------------
 
 
 class Line(gymnasium.Env):
@@ -169,7 +186,9 @@ def test_frames_need_a_render_mode():
     filmed = Task.from_gymnasium("ddco-test/Line-v0", {"supervisor": Towards}, render_mode="rgb_array")
     assert run_episode(filmed, "supervisor", 0, film=True).frames[0].shape == (8, 8, 3)
     with pytest.raises(BadInput, match="render_mode='rgb_array'"):
-        run_episode(Task.from_gymnasium("ddco-test/Line-v0", {"supervisor": Towards}), "supervisor", 0, film=True)
+        run_episode(
+            Task.from_gymnasium("ddco-test/Line-v0", {"supervisor": Towards}), "supervisor", 0, film=True
+        )
 
 
 def test_what_cannot_be_a_task_is_refused():

@@ -69,7 +69,9 @@ def said(data: Any, models: list[type[Model]]) -> Iterator[str]:
                 if key in known:
                     yield setting(model, key)
                     named = get_origin(known[key].annotation) is dict and isinstance(value, dict)
-                    yield from said([*value.values()] if named else value, list(models_in(known[key].annotation)))
+                    yield from said(
+                        [*value.values()] if named else value, list(models_in(known[key].annotation))
+                    )
 
 
 ELSEWHERE = {
@@ -86,7 +88,12 @@ ELSEWHERE = {
     "notebooks/09_bayesian_options.py": ("Spec.inference",),
     "studies/arena.yaml": ("RidgeSpec.gate", "RidgeSpec.policy"),
     "studies/cells.py": ("Spec.seed", "TrainingSpec.seed"),
-    "studies/library.yaml": ("LibrarySpec.ridge", "LibrarySpec.run", "LibrarySpec.spread", "TrainingSpec.library"),
+    "studies/library.yaml": (
+        "LibrarySpec.ridge",
+        "LibrarySpec.run",
+        "LibrarySpec.spread",
+        "TrainingSpec.library",
+    ),
     "studies/people.py": ("LabelsSpec.recogniser", "RecogniserSpec.ridge", "RecogniserSpec.weight"),
 }
 """What no spec uses, but a study, a notebook, or what ``init`` writes."""
@@ -108,9 +115,9 @@ def places() -> dict[str, str]:
 
 
 def test_every_setting_is_used(places: dict[str, str]) -> None:
-    """And no more than these. A setting is a key that a spec can have, counted once for the class that declares it
-    first. So a network, or a σ, is the same wherever it stands; ``network`` is one setting of all networks, and
-    ``hidden`` of those with layers; ``kind`` and ``std`` of a part are those of the control.
+    """And no more than these. A setting is a key that a spec can have, counted once for the class that
+    declares it first. So a network, or a σ, is the same wherever it stands; ``network`` is one setting of all
+    networks, and ``hidden`` of those with layers; ``kind`` and ``std`` of a part are those of the control.
     """
     print(*(f"{one:40} {places.get(one, 'nowhere')}" for one in ALL), sep="\n")
     assert [one for one in ALL if one not in places] == []

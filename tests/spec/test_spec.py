@@ -60,7 +60,7 @@ VALIDATOR = jsonschema.Draft202012Validator(spec_schema())
 jsonschema.Draft202012Validator.check_schema(VALIDATOR.schema)
 
 
-# --- what it accepts --------------------------------------------------------------------------------------------------
+# --- what it accepts ----------------------------------------------------------------------------------------
 
 
 def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
@@ -77,17 +77,27 @@ def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
         ({}, ()),
         ({"policy": {"inputs": ["a", "b"]}, "termination": {"inputs": ["b", "c"]}}, ("a", "b")),
         ({"policy": {"network": "branches", "of": {"a": {}, "x": {"inputs": ["c", "a"]}}}}, ("a", "c")),
-        ({"policy": {"network": "lstm", "over": {"network": "branches", "of": {"a": {"network": "conv"}}}}}, ("a",)),
+        (
+            {
+                "policy": {
+                    "network": "lstm",
+                    "over": {"network": "branches", "of": {"a": {"network": "conv"}}},
+                }
+            },
+            ("a",),
+        ),
         ({"policy": {"network": "lstm", "inputs": ["b"]}}, ("b",)),
     ],
 )
 def test_what_the_policies_of_a_level_read(level: dict[str, object], read: tuple[str, ...]) -> None:
     hierarchy = HierarchySpec.model_validate({"levels": [{"count": 2, **level}]})
     assert hierarchy.read_by(1) == read
-    assert HierarchySpec.model_validate({"levels": [{"count": 2}], "trunk": {"inputs": ["c"]}}).read_by(1) == ("c",)
+    assert HierarchySpec.model_validate({"levels": [{"count": 2}], "trunk": {"inputs": ["c"]}}).read_by(
+        1
+    ) == ("c",)
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files --------------------------------------------------------------------------------------------------
 
 
 DEEP = "not valid YAML: nested too deeply"
@@ -98,7 +108,10 @@ DEEP = "not valid YAML: nested too deeply"
     [
         ("", "holds null, not a mapping (key: value), as a spec is"),
         ("- a\n- b\n", "holds ['a', 'b'], not a mapping (key: value), as a spec is"),
-        ("seed: 1\ntask: [a\n", "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'"),
+        (
+            "seed: 1\ntask: [a\n",
+            "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'",
+        ),
         ("seed: 1\ntask: a\nseed: 2\n", "line 3, column 1: not valid YAML: key 'seed' is given twice"),
         ("a: *b\n", "line 1, column 4: not valid YAML: found undefined alias 'b'"),
         pytest.param("[" * 1000, DEEP, id="opened"),
@@ -117,11 +130,15 @@ def test_files_that_hold_no_spec(tmp_path: Path, text: str | bytes, message: str
     assert "\n" not in str(caught.value)
 
 
-# --- overrides --------------------------------------------------------------------------------------------------------
+# --- overrides ----------------------------------------------------------------------------------------------
 
 
 def test_overrides_are_applied_to_the_file(tmp_path: Path) -> None:
-    overrides = ["hierarchy.levels.0.count=3", "training.optimizer.lr=1e-2", "observations.1.differences=true"]
+    overrides = [
+        "hierarchy.levels.0.count=3",
+        "training.optimizer.lr=1e-2",
+        "observations.1.differences=true",
+    ]
     spec = load_spec(write(tmp_path, EXAMPLE), [*overrides, "rollout={episodes: 2, policies: [open_loop]}"])
     assert spec.hierarchy.levels[0].count == 3
     assert spec.training.optimizer.lr == 0.01
@@ -146,7 +163,9 @@ def test_overrides_that_cannot_be_applied(tmp_path: Path, override: str, message
 def test_with_overrides_leaves_the_original_alone(tmp_path: Path) -> None:
     spec = load_spec(write(tmp_path, EXAMPLE))
     before = dump_spec(spec)
-    other = with_overrides(spec, {"hierarchy.levels.0.count": 2, "selection.grid.hierarchy.levels.0.count": [2, 3]})
+    other = with_overrides(
+        spec, {"hierarchy.levels.0.count": 2, "selection.grid.hierarchy.levels.0.count": [2, 3]}
+    )
     assert other.hierarchy.levels[0].count == 2
     assert other.selection.grid == {"hierarchy.levels.0.count": (2, 3)}
     assert dump_spec(spec) == before
@@ -191,7 +210,7 @@ def test_a_name_that_looks_like_a_number_stays_a_name(name: str) -> None:
     assert parse_spec(read_yaml(text)).observed == [name]
 
 
-# --- specs that are written, and the schema ---------------------------------------------------------------------------
+# --- specs that are written, and the schema -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -212,11 +231,19 @@ def test_all_defaults_are_written() -> None:
     assert set(written) == set(Spec.model_fields)
 
 
-WRONG_NETWORKS = {"network": "mpl"}, {"hidden": [0]}, {"hiden": [3]}, {"dropout": 1}, {"network": "conv", "layers": []}
+WRONG_NETWORKS = (
+    {"network": "mpl"},
+    {"hidden": [0]},
+    {"hiden": [3]},
+    {"dropout": 1},
+    {"network": "conv", "layers": []},
+)
 WRONG = [{"hierarchy.levels.0.policy": network} for network in WRONG_NETWORKS]
 
 
-@pytest.mark.parametrize("values", [*WRONG, {"hierarchy.levels.0.count": 0}, {"observation": ["pose"]}], ids=str)
+@pytest.mark.parametrize(
+    "values", [*WRONG, {"hierarchy.levels.0.count": 0}, {"observation": ["pose"]}], ids=str
+)
 def test_the_schema_refuses_what_is_refused(values: dict[str, Any]) -> None:
     VALIDATOR.validate(SMALL)
     wrong = edited(SMALL, values)
@@ -233,7 +260,7 @@ def test_the_schema_describes_every_key_and_requires_observations_alone() -> Non
     assert [name for name, field in fields if not {"description", "$ref", "const"} & set(field)] == []
 
 
-# --- what is refused, and in which words ------------------------------------------------------------------------------
+# --- what is refused, and in which words --------------------------------------------------------------------
 
 
 def refusal(overrides: dict[str, Any]) -> str:
@@ -251,19 +278,49 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "compare_with.0.policy.network: per_",
     ),
     ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
-    ({"hierarchy.levels.0.cuont": 5}, "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?"),
+    (
+        {"hierarchy.levels.0.cuont": 5},
+        "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?",
+    ),
     ({"inference": "exact"}, "inference: must be fused or enumerate"),
-    ({"hierarchy.levels": [{"count": 1}, {"count": 2}]}, "hierarchy.levels.1.name: 'option' is also the name of"),
+    (
+        {"hierarchy.levels": [{"count": 1}, {"count": 2}]},
+        "hierarchy.levels.1.name: 'option' is also the name of",
+    ),
     ({"hierarchy.levels.0.name": "a b"}, "hierarchy.levels.0.name: must be letters, digits, '_' or '-'"),
-    ({"hierarchy.levels.0.policy.emits": ["options", "control"]}, "hierarchy.levels.0.policy.emits: the lowest level"),
-    ({"hierarchy.meta_policy.emits": ["options", "options"]}, "hierarchy.meta_policy.emits: 'options' is given twice"),
+    (
+        {"hierarchy.levels.0.policy.emits": ["options", "control"]},
+        "hierarchy.levels.0.policy.emits: the lowest level",
+    ),
+    (
+        {"hierarchy.meta_policy.emits": ["options", "options"]},
+        "hierarchy.meta_policy.emits: 'options' is given twice",
+    ),
     ({"hierarchy.meta_policy.network": "mpl"}, "hierarchy.meta_policy.network: no network is called 'mpl'"),
-    ({"demonstrations": {"path": "a", "hold_out_by": "b", "valid_fraction": 0}}, "demonstrations.hold_out_by: holds"),
-    ({"hierarchy.trunk": {"network": "constant"}}, "hierarchy.trunk.network: a constant has no features for others"),
-    ({"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}}, "hierarchy.meta_policy.inputs: a constant"),
-    ({"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}}, "hierarchy.meta_policy.hidden: unknown key"),
-    ({"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "std": 1}]}, "control.parts.0.std: does"),
-    ({"observations": ["state", {"key": "step", "differences": True}]}, "observations.1.differences: does not apply"),
+    (
+        {"demonstrations": {"path": "a", "hold_out_by": "b", "valid_fraction": 0}},
+        "demonstrations.hold_out_by: holds",
+    ),
+    (
+        {"hierarchy.trunk": {"network": "constant"}},
+        "hierarchy.trunk.network: a constant has no features for others",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}},
+        "hierarchy.meta_policy.inputs: a constant",
+    ),
+    (
+        {"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}},
+        "hierarchy.meta_policy.hidden: unknown key",
+    ),
+    (
+        {"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "std": 1}]},
+        "control.parts.0.std: does",
+    ),
+    (
+        {"observations": ["state", {"key": "step", "differences": True}]},
+        "observations.1.differences: does not apply",
+    ),
     (
         {"hierarchy.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
         "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, constant, got 'lstm'",
@@ -276,18 +333,36 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "compare_with.0.policy: flat_equal w",
     ),
     ({"hierarchy": None, "baseline": "flat_equal"}, "baseline: flat_equal takes its size from a hierarchy"),
-    ({"training.epochs": None, "training.patience": None}, "training.epochs: epochs and training.patience are both"),
-    ({"training.labels": {"level": "optoin", "from": "phase"}}, "training.labels.level: there is no level 'optoin'"),
-    ({"training.labels": {"level": "option", "form": "phase"}}, "training.labels.from: missing; it has to be"),
+    (
+        {"training.epochs": None, "training.patience": None},
+        "training.epochs: epochs and training.patience are both",
+    ),
+    (
+        {"training.labels": {"level": "optoin", "from": "phase"}},
+        "training.labels.level: there is no level 'optoin'",
+    ),
+    (
+        {"training.labels": {"level": "option", "form": "phase"}},
+        "training.labels.from: missing; it has to be",
+    ),
     (
         {"hierarchy.meta_policy.emits": ["control"], "training.labels": {"level": "option", "from": "phase"}},
         "training.labels.level: no policy selects the options of 'option'; let the policies above emit options",
     ),
-    ({"training.starts": ["clusters"]}, "training.starts.0: must be vq or vq_controls or windows or equal_parts"),
+    (
+        {"training.starts": ["clusters"]},
+        "training.starts.0: must be vq or vq_controls or windows or equal_parts",
+    ),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
-    ({"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"}, "report.trajectory: there is no"),
-    ({"report.trajectory": ["pose", "grip", 3]}, "report.trajectory: must be KEY or [KEY, slice], such as [pose, 3:6]"),
+    (
+        {"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"},
+        "report.trajectory: there is no",
+    ),
+    (
+        {"report.trajectory": ["pose", "grip", 3]},
+        "report.trajectory: must be KEY or [KEY, slice], such as [pose, 3:6]",
+    ),
     ({"report.trajectory": ["pose", "3-6"]}, "report.trajectory: there is no observation '3-6'"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
@@ -295,20 +370,46 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
     ({"model": 3}, "model: must be options, a baseline such as flat or mixture, a list of levels, or a"),
     ({"hierarchy": None, "baseline": "mixture"}, "baseline: mixture takes its experts from"),
-    ({"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]}, "compare_with.0: mixture takes its experts"),
-    ({"compare_with": [{"kind": "mixture", "policy": {}}]}, "compare_with.0.policy: a mixture has the networks of"),
-    ({"hierarchy.levels.0.termination": "always", "compare_with": ["mixture"]}, "compare_with.0: the hierarchy is a"),
-    ({"hierarchy.levels.0.termination": "alway"}, "hierarchy.levels.0.termination: must be a network, such as"),
-    ({"control.std": {**OF_STATE, "per_option": True}}, "control.std.per_option: per_state gives each option its own"),
+    (
+        {"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]},
+        "compare_with.0: mixture takes its experts",
+    ),
+    (
+        {"compare_with": [{"kind": "mixture", "policy": {}}]},
+        "compare_with.0.policy: a mixture has the networks of",
+    ),
+    (
+        {"hierarchy.levels.0.termination": "always", "compare_with": ["mixture"]},
+        "compare_with.0: the hierarchy is a",
+    ),
+    (
+        {"hierarchy.levels.0.termination": "alway"},
+        "hierarchy.levels.0.termination: must be a network, such as",
+    ),
+    (
+        {"control.std": {**OF_STATE, "per_option": True}},
+        "control.std.per_option: per_state gives each option its own",
+    ),
     ({"hierarchy": None, "baseline": {"kind": "flat", "std": OF_STATE}}, "baseline.std: is for baselines in"),
     ({"compare_with": [{"kind": "flat", "std": OF_STATE}]}, "compare_with.0.std: no σ in control is learned"),
-    ({"hierarchy.trunk": {}, "hierarchy.meta_policy": {"inputs": ["pose"]}}, "hierarchy.meta_policy.inputs: the trunk"),
-    ({"hierarchy.levels": TWO_LEVELS, **SEGMENTS}, "hierarchy.levels.1.policy.emits: training.layerwise: segments"),
-    ({"hierarchy.meta_policy.emits": ["control"], **SEGMENTS}, "hierarchy.meta_policy.emits: training.layerwise: segm"),
+    (
+        {"hierarchy.trunk": {}, "hierarchy.meta_policy": {"inputs": ["pose"]}},
+        "hierarchy.meta_policy.inputs: the trunk",
+    ),
+    (
+        {"hierarchy.levels": TWO_LEVELS, **SEGMENTS},
+        "hierarchy.levels.1.policy.emits: training.layerwise: segments",
+    ),
+    (
+        {"hierarchy.meta_policy.emits": ["control"], **SEGMENTS},
+        "hierarchy.meta_policy.emits: training.layerwise: segm",
+    ),
 ]
 
 
-@pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=[message.partition(",")[0] for _, message in REFUSED])
+@pytest.mark.parametrize(
+    ("overrides", "message"), REFUSED, ids=[message.partition(",")[0] for _, message in REFUSED]
+)
 def test_refused_with_the_key_path_and_one_line(overrides: dict[str, Any], message: str) -> None:
     assert refusal(overrides).startswith(message)
 
@@ -333,7 +434,23 @@ def places(node: Any) -> Iterator[tuple[Any, Any]]:
             yield from places(node[key])
 
 
-ODD = (None, True, -1, 10**40, 1e-320, float("nan"), "", "x" * 9999, "a:b:c", "\0", [], [[]], [None], {}, {"a": {}})
+ODD = (
+    None,
+    True,
+    -1,
+    10**40,
+    1e-320,
+    float("nan"),
+    "",
+    "x" * 9999,
+    "a:b:c",
+    "\0",
+    [],
+    [[]],
+    [None],
+    {},
+    {"a": {}},
+)
 
 
 def test_an_odd_value_anywhere_is_read_or_refused_in_lines() -> None:
@@ -361,10 +478,16 @@ LEVELS = "hierarchy.levels"
     [
         (f"{LEVELS}.0.count", [1, 0], "value 0: KEY: must be at least 1, got 0"),
         (f"{LEVELS}.0.cuont", [1], f"value 1: KEY: unknown key; did you mean {LEVELS}.0.count?"),
-        (f"{LEVELS}.1.count", [1], "value 1: KEY: '1' is not the number of one of the 1 items there (the first is 0)"),
+        (
+            f"{LEVELS}.1.count",
+            [1],
+            "value 1: KEY: '1' is not the number of one of the 1 items there (the first is 0)",
+        ),
         ("selection.folds", [3], "the selection cannot be part of its own grid; remove it"),
         ("seed", 3, "must be a list, got 3"),
     ],
 )
 def test_every_value_of_a_grid_has_to_be_valid_in_place(key: str, values: object, message: str) -> None:
-    assert refusal({"selection.grid": {key: values}}) == f"selection.grid.{key}: {message.replace('KEY', key)}"
+    assert (
+        refusal({"selection.grid": {key: values}}) == f"selection.grid.{key}: {message.replace('KEY', key)}"
+    )

@@ -68,7 +68,9 @@ WORK = ["check", "collect", "fit", "select"]
     [*(("check", *one) for one in PLACES), *((command, *PLACES[2]) for command in WORK[1:])],
     ids=lambda value: value,
 )
-def test_a_spec_that_names_code_is_refused(spec: Path, imported: Path, command: str, override: str, place: str) -> None:
+def test_a_spec_that_names_code_is_refused(
+    spec: Path, imported: Path, command: str, override: str, place: str
+) -> None:
     name = TASK if place.endswith("task") else NETWORK
     before = sorted(imported.parent.iterdir())
     said = f"{spec}: {place}: would import user code ({name}); pass --allow-code if you trust it (in Python: allow_code"
@@ -83,7 +85,7 @@ def test_what_is_allowed_is_imported(spec: Path, imported: Path, override: str) 
     assert imported.exists()
 
 
-# --- run folders ------------------------------------------------------------------------------------------------------
+# --- run folders --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -127,7 +129,7 @@ def test_a_baseline_in_a_run_that_names_code_which_the_run_does_not(
     assert not imported.exists()
 
 
-# --- what is no user code ---------------------------------------------------------------------------------------------
+# --- what is no user code -----------------------------------------------------------------------------------
 
 
 def test_what_is_built_in_or_registered_is_no_user_code(toy_spec: Any) -> None:

@@ -64,7 +64,11 @@ def test_an_exported_controller_plays_as_its_fit_does(fitted, runner, goal, succ
             expected.append(controller.act(observation))
             observation, done, ended = world.step(expected[-1])
         played = World(goal)
-        assert play(runner, played, seed) == {"success": success, "steps": len(expected), "time": len(expected)}
+        assert play(runner, played, seed) == {
+            "success": success,
+            "steps": len(expected),
+            "time": len(expected),
+        }
         assert (len(expected) < 30) == success
         np.testing.assert_allclose(played.received, expected, atol=1e-5)
 
@@ -89,7 +93,10 @@ def test_the_first_successes_are_recorded(tmp_path):
     arena_recording.collect(path, "toy", episode, 4, 1)
     with h5py.File(path) as file:
         assert [group.attrs["seed"] for group in file["data"].values()] == [0, 1, 3, 4]
-        assert (list(file["mask/valid"]), list(file["mask/train"])) == ([b"demo_0"], [b"demo_1", b"demo_2", b"demo_3"])
+        assert (list(file["mask/valid"]), list(file["mask/train"])) == (
+            [b"demo_0"],
+            [b"demo_1", b"demo_2", b"demo_3"],
+        )
         assert file["data/demo_2/dones"][()].tolist() == [False] * 6 + [True]
         assert file["data"].attrs["total"] == 4 + 5 + 7 + 8
 

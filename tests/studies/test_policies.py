@@ -157,10 +157,14 @@ class Here:
     def played(self, task, methods, first, episodes):
         methods["policy"].write(self.folder)
         errors = [
-            np.abs(acted(arena_playing.exported(self.folder), self.demo.observations, seed) - self.demo.actions).max()
+            np.abs(
+                acted(arena_playing.exported(self.folder), self.demo.observations, seed) - self.demo.actions
+            ).max()
             for seed in range(first, first + episodes)
         ]
-        return {"episodes": {"policy": [{"error": error, "seed": first + n} for n, error in enumerate(errors)]}}
+        return {
+            "episodes": {"policy": [{"error": error, "seed": first + n} for n, error in enumerate(errors)]}
+        }
 
 
 def test_a_world_trains_with_the_settings_of_a_cell_and_plays_what_it_wrote(tmp_path):

@@ -153,7 +153,10 @@ def test_a_fixed_sequence_ends_where_a_contrast_does_not_hold(p_values, said):
 @pytest.mark.parametrize(
     ("p_values", "said"),
     [
-        ([0.01, 0.9, 0.02, 0.001], ["holds", "inconclusive", "holds", "holds"]),  # the last waits for its twin, 2
+        (
+            [0.01, 0.9, 0.02, 0.001],
+            ["holds", "inconclusive", "holds", "holds"],
+        ),  # the last waits for its twin, 2
         ([0.01, 0.01, 0.3, 0.99], ["holds", "holds", "inconclusive", "does not hold"]),
         ([0.4, 0.01, 0.01, 0.01], ["inconclusive", "holds", "not reached", "not reached"]),
     ],

@@ -89,7 +89,12 @@ def done(file):
 TUNED = {
     "choose": "nats",
     "seeds": {"test": {"count": 1}, "development": {"first": 7, "count": 1}},
-    "demonstrations": {"counts": [3], "held_out": 2, "test": {"count": 6}, "development": {"first": 6, "count": 6}},
+    "demonstrations": {
+        "counts": [3],
+        "held_out": 2,
+        "test": {"count": 6},
+        "development": {"first": 6, "count": 6},
+    },
     "contrasts": [],
 }
 GRID, FLAT = {"options": {"grid": {"control.std": [0.1, 0.2]}}}, {"flat": {"baseline": "flat"}}
@@ -101,21 +106,45 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
     ("changes", "said"),
     [
         ({"seed": {}}, "seed: unknown key; did you mean seeds?"),
-        ({"seeds": {"test": {"count": 3}, "development": {"first": 2, "count": 1}}}, "seeds.development: 2 to 2 "),
-        ({"demonstrations": RECORDED, "starts": {"test": {"first": 39, "count": 10}}}, "starts.test: 39 to 58"),
+        (
+            {"seeds": {"test": {"count": 3}, "development": {"first": 2, "count": 1}}},
+            "seeds.development: 2 to 2 ",
+        ),
+        (
+            {"demonstrations": RECORDED, "starts": {"test": {"first": 39, "count": 10}}},
+            "starts.test: 39 to 58",
+        ),
         ({"demonstrations": {**RECORDED, "test": {"count": 14}}}, "must be at least 15"),
         ({"measures": ["nat"]}, "there is no measure 'nat' (did you mean 'nats'?)"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
-        ({"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]}, "not among measures"),
+        (
+            {"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]},
+            "not among measures",
+        ),
         ({"failed": {"success": 0.0}}, "failed.success: 'success' is not among measures"),
-        ({"contrasts": [{**STUDY["contrasts"][0], "kind": "equivalence"}]}, "contrasts.0.margin: missing; say which"),
+        (
+            {"contrasts": [{**STUDY["contrasts"][0], "kind": "equivalence"}]},
+            "contrasts.0.margin: missing; say which",
+        ),
         ({"families": {"door": ["open", "close"]}}, "families: must have tasks of the study, each once"),
         ({"choose": "nats"}, "choose: goes together with seeds.development"),
         ({**TUNED, "methods": GRID | FLAT}, "unequal numbers of points to choose from (options 2, flat 1)"),
-        ({**TUNED, "methods": {"options": SAME} | FLAT}, "methods: have nothing to choose from; give each a grid"),
-        ({"methods": {"options": SAME | {"overrides": {"control.std": 0.2}}}}, "has 'control.std', which the grid has"),
-        ({"methods": GRID, "contrasts": []}, "choose: missing; name the measure that chooses among the points"),
-        ({"overrides": {"control.stdd": 0.1}}, "options: control.stdd: unknown key; did you mean control.std?"),
+        (
+            {**TUNED, "methods": {"options": SAME} | FLAT},
+            "methods: have nothing to choose from; give each a grid",
+        ),
+        (
+            {"methods": {"options": SAME | {"overrides": {"control.std": 0.2}}}},
+            "has 'control.std', which the grid has",
+        ),
+        (
+            {"methods": GRID, "contrasts": []},
+            "choose: missing; name the measure that chooses among the points",
+        ),
+        (
+            {"overrides": {"control.stdd": 0.1}},
+            "options: control.stdd: unknown key; did you mean control.std?",
+        ),
     ],
 )
 def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, said):
@@ -126,7 +155,9 @@ def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, s
 
 def test_the_page_names_every_key():
     page = (ROOT / "docs" / "studies.md").read_text()
-    models = [one for one in vars(declaration).values() if getattr(one, "__module__", "") == declaration.__name__]
+    models = [
+        one for one in vars(declaration).values() if getattr(one, "__module__", "") == declaration.__name__
+    ]
     keys = {key for one in models for key in getattr(one, "model_fields", {})}
     assert "margin" in keys
     assert not {key for key in keys if f"`{key}`" not in page}
@@ -137,7 +168,10 @@ def test_the_page_names_every_key():
     [
         ({"kept": [{"table": "spec.yaml"}]}, "spec.yaml: is damaged"),
         ({"world": "nowhere:WORLD"}, "world: nowhere:WORLD cannot be loaded: No module named"),
-        ({"world": "simulated:WORLD", "methods": {"on": {"by": "flo"}}, "contrasts": []}, "has no method 'flo' (did"),
+        (
+            {"world": "simulated:WORLD", "methods": {"on": {"by": "flo"}}, "contrasts": []},
+            "has no method 'flo' (did",
+        ),
     ],
 )
 def test_worlds_and_tables_that_cannot_be_used_are_refused_before_any_work(made, changes, said):
@@ -170,7 +204,9 @@ def test_in_a_registered_task_every_training_seed_has_its_own_episodes(tmp_path)
     state = folder.run(HERE)
     assert not state.failed
     for seed, cell in enumerate(folder.cells("test")):
-        recorded = Demonstrations.read(folder.path / "demonstrations" / f"toy_task-task-{10 + 8 * seed}-6.hdf5")
+        recorded = Demonstrations.read(
+            folder.path / "demonstrations" / f"toy_task-task-{10 + 8 * seed}-6.hdf5"
+        )
         assert recorded.names == tuple(f"demo_{n}" for n in range(10 + 8 * seed, 16 + 8 * seed))
         controller = load(folder.path / "work" / folder.key(cell) / "fit").controller()
         outcomes = [run_episode(toy_task.task, controller, 500 + 5 * seed + n).outcome for n in range(5)]
@@ -238,8 +274,8 @@ WORLD = World()
 def test_a_frozen_test_is_fresh(study, count):
     """Its tasks and seeds are no other study's, and no other page names one of the tasks.
 
-    Drawer-open is of development since the first test. Studies of libraries take tasks of both tests since these were
-    done, and choose nothing on them.
+    Drawer-open is of development since the first test. Studies of libraries take tasks of both tests since
+    these were done, and choose nothing on them.
     """
     frozen = Study.load(ROOT / "studies" / f"{study}.yaml")
     pages = [path.read_text() for path in (ROOT / "docs").rglob("*.md")
@@ -281,7 +317,9 @@ def test_planted_options_win_in_the_table_and_the_contrast(done):
     assert not state.missing
     said = report(done, state)
     rows = read_tidy(done.path / "table.csv")
-    assert len(rows[rows.measure.isin(["nats", "nmi"])]) == 2 * 2 * 2 + 2 * 2  # nats of both methods, nmi of options
+    assert (
+        len(rows[rows.measure.isin(["nats", "nmi"])]) == 2 * 2 * 2 + 2 * 2
+    )  # nats of both methods, nmi of options
     (contrast,) = statistics.tested(done.study, rows)
     nats = rows[(rows.measure == "nats") & (rows.demonstrations == "6")].set_index(["method", "seed"]).value
     by_hand = [nats["options", seed] - nats["flat", seed] for seed in "01"]
@@ -369,7 +407,9 @@ def test_a_failed_cell_counts_what_is_declared(made, monkeypatch, tmp_path):
     rows = read_tidy(folder.path / "table.csv")
     (contrast,) = statistics.tested(folder.study, rows)
     assert contrast.estimate.units == pytest.approx([own + 50 for own in options], rel=1e-8)
-    assert "failed, and count nats -50: unexpected ZeroDivisionError: division by zero (2)" in [*told(folder, state)]
+    assert "failed, and count nats -50: unexpected ZeroDivisionError: division by zero (2)" in [
+        *told(folder, state)
+    ]
     second = made(**SMALL, failed={"nats": -50.0}, kept=[{"table": "out/table.csv"}])
     elsewhere = Folder(second.study, tmp_path / "elsewhere")
     assert (len(elsewhere.state().done), len(elsewhere.state().failed)) == (2, 2)
@@ -408,14 +448,20 @@ def test_a_pinned_study_is_of_one_commit(made, monkeypatch, tmp_path):
     table = pd.read_csv(tmp_path / "table.csv", dtype=str)
     table.head(1).to_csv(tmp_path / "fewer.csv", index=False)
     fewer = Folder(pinned(kept=[{"table": "fewer.csv"}]).study, tmp_path / "fewer")
-    with pytest.raises(BadInput, match="pinned: results are of commit 11aa, here is 22bb; run it at that commit, or"):
+    with pytest.raises(
+        BadInput, match="pinned: results are of commit 11aa, here is 22bb; run it at that commit, or"
+    ):
         fewer.run(HERE)
-    table.assign(code=np.where(table.seed == table.seed[0], "11aa", "22bb")).to_csv(tmp_path / "mixed.csv", index=False)
+    table.assign(code=np.where(table.seed == table.seed[0], "11aa", "22bb")).to_csv(
+        tmp_path / "mixed.csv", index=False
+    )
     mixed = Folder(pinned(kept=[{"table": "mixed.csv"}]).study, tmp_path / "mixed")
     assert "pinned: results are of commits 11aa, 22bb; keep those of one" in refused(mixed)
     with pytest.raises(BadInput, match="pinned: the code has changes since 11aa; commit them"):
         Folder(pinned().study, tmp_path / "third").run(HERE)
-    changed = Folder(pinned(kept=kept, in_spec={"seed": 1}, overrides={"control.std": 0.4}).study, tmp_path / "fourth")
+    changed = Folder(
+        pinned(kept=kept, in_spec={"seed": 1}, overrides={"control.std": 0.4}).study, tmp_path / "fourth"
+    )
     assert "was done with key" in refused(changed)
     table = pd.read_csv(tmp_path / "table.csv")
     table[statistics.COLUMNS].to_csv(tmp_path / "table.csv", index=False)
@@ -477,7 +523,11 @@ def test_the_best_point_on_development_seeds_is_tested(made):
     assert tested == {("options", 0.5), ("flat", 0.5)}
     report(folder, state)
     rows = read_tidy(folder.path / "table.csv")
-    names = {"options", "flat", *(f"{name} (std = {std})" for name in ("options", "flat") for std in (0.5, 50.0))}
+    names = {
+        "options",
+        "flat",
+        *(f"{name} (std = {std})" for name in ("options", "flat") for std in (0.5, 50.0)),
+    }
     assert {*rows.method} == names
     chosen = "the points with the highest nats in development: options (std = 0.5), flat (std = 0.5)"
     assert chosen in [*told(folder, state)]
@@ -492,10 +542,16 @@ def test_a_measure_of_nothing_is_better_than_less(made):
 
     def chosen(first):
         values = {(7, 0.5): first, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
-        done = {one: cells.Done(values={"nats": values[one.seed, one.point["control.std"]]}) for one in places}
+        done = {
+            one: cells.Done(values={"nats": values[one.seed, one.point["control.std"]]}) for one in places
+        }
         return folder.chosen(cells.State(places, done, {}))["options"]["control.std"]
 
-    assert [chosen(first) for first in (-1.0, -0.7, None)] == [1.0, 0.5, 1.0]  # None: it applies to no episode
+    assert [chosen(first) for first in (-1.0, -0.7, None)] == [
+        1.0,
+        0.5,
+        1.0,
+    ]  # None: it applies to no episode
 
 
 def test_some_tasks_choose_for_all(made):

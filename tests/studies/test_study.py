@@ -39,10 +39,14 @@ class Toy(Cell):
 
 def run(monkeypatch, tmp_path, words):
     """Run it with these words; what has been done so far."""
-    monkeypatch.setattr("sys.argv", ["toy.py", *words, "--runs", f"{tmp_path}/runs", "--out", f"{tmp_path}/toy.csv"])
+    monkeypatch.setattr(
+        "sys.argv", ["toy.py", *words, "--runs", f"{tmp_path}/runs", "--out", f"{tmp_path}/toy.csv"]
+    )
     parser = described("A toy.")
     parser.add_argument("--tasks", nargs="*", default=["a", "b"])
-    study.main("toy", parser, DEFAULTS, lambda own: [Toy(task, seed) for task in own.tasks for seed in (2, 4)])
+    study.main(
+        "toy", parser, DEFAULTS, lambda own: [Toy(task, seed) for task in own.tasks for seed in (2, 4)]
+    )
     return (tmp_path / "runs" / "done").read_text().split()
 
 

@@ -19,8 +19,8 @@ def random_tables(
     steps: int = 4,
     seed: int = 0,
 ) -> Tables:
-    """Random normalised tables: ``counts`` options a level, lowest first; ``hybrid[d]`` says whether the callers of
-    level d may emit control."""
+    """Random normalised tables: ``counts`` options a level, lowest first; ``hybrid[d]`` says whether the
+    callers of level d may emit control."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -33,7 +33,9 @@ def random_tables(
         if not hybrid[level]:
             logits[..., 0] = NEVER
         selection.append(logits.log_softmax(-1))
-        control.append(2 * normal(caller) if hybrid[level] else torch.full((trajectories, steps, caller), NEVER))
+        control.append(
+            2 * normal(caller) if hybrid[level] else torch.full((trajectories, steps, caller), NEVER)
+        )
     logits = [normal(count) for count in counts]
     termination = [torch.stack([(-x).sigmoid().log(), x.sigmoid().log()], -1) for x in logits]
     return Tables(tuple(selection), tuple(termination), tuple(control if counts else [normal(1)]))
@@ -105,7 +107,9 @@ def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tup
     known = _lists(tables, n)
 
     @functools.cache
-    def following(t: int, before: tuple[int, ...] | None) -> list[tuple[tuple[int, ...], tuple[int, ...], float]]:
+    def following(
+        t: int, before: tuple[int, ...] | None
+    ) -> list[tuple[tuple[int, ...], tuple[int, ...], float]]:
         steps = ((h, b) for h in joint for b in (ends if t else [(1,) * len(sizes)]))
         return [(h, b, p) for h, b in steps if (p := _step(known, t, h, b, before)) > 0]
 
@@ -126,7 +130,9 @@ def _lists(tables: Tables, n: int) -> Tables:
     return Tables(*cut, power=tables.power)
 
 
-def _step(tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before: tuple[int, ...] | None) -> float:
+def _step(
+    tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before: tuple[int, ...] | None
+) -> float:
     probability = 1.0
     for d in range(len(h)):
         if before is not None:
@@ -143,7 +149,9 @@ def _step(tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before
             probability *= float(h[d] == 0)
         else:
             probability *= math.exp(tables.selection[d][t][0 if caller is None else caller - 1][h[d]])
-    evidence = sum(table[t][choice] for table, choice in zip(tables.evidence, h, strict=False) if table is not None)
+    evidence = sum(
+        table[t][choice] for table, choice in zip(tables.evidence, h, strict=False) if table is not None
+    )
     return probability * math.exp(tables.power * log_density(tables, t, h) + evidence)
 
 

@@ -27,7 +27,9 @@ def small_spec(counts=(2,), policy=LINEAR, name="level", **sections):
 
     :param name: of the level; of several levels each has its number behind it.
     """
-    names = [name] if len(counts) == 1 and name != "level" else [f"{name}-{d}" for d in range(1, 1 + len(counts))]
+    names = (
+        [name] if len(counts) == 1 and name != "level" else [f"{name}-{d}" for d in range(1, 1 + len(counts))]
+    )
     levels = [{"name": own, "count": k, "policy": policy} for own, k in zip(names, counts, strict=True)]
     flat = {"baseline": {"kind": "flat", "policy": policy}}
     return parse_spec(
@@ -48,7 +50,10 @@ def make_spec(counts=(2,), seed=0, control=None, **training):
 def in_units_of(spec, demos, sigma=SIGMA):
     """A spec with the truth's σ in the units to which the controls of these demonstrations are scaled."""
     spreads = np.concatenate([demo.actions for demo in demos]).std(0)
-    parts = [{"name": f"x{d}", "dims": [d], "kind": "gaussian", "std": sigma / own} for d, own in enumerate(spreads)]
+    parts = [
+        {"name": f"x{d}", "dims": [d], "kind": "gaussian", "std": sigma / own}
+        for d, own in enumerate(spreads)
+    ]
     return with_overrides(spec, {"control.parts": parts})
 
 
@@ -77,7 +82,9 @@ def plant(truth, number, steps, seed):
         choices.append(torch.stack(previous, -1))
         state = (state + action[:, :2].float()).clamp(-1, 1)
     arrays = [torch.stack(part, 1).double().numpy() for part in (states, actions)]
-    return numbered(({"state": state}, action) for state, action in zip(*arrays, strict=True)), torch.stack(choices, 1)
+    return numbered(({"state": state}, action) for state, action in zip(*arrays, strict=True)), torch.stack(
+        choices, 1
+    )
 
 
 def preferences(callers, options):
@@ -99,7 +106,9 @@ def make_truth(spec, ending=-1.7):
                 level.policy.network.layers[0].bias[:] = 0.35 * corners[: level.count, None]
             else:
                 level.policy.network.layers[0].weight.zero_()
-                level.policy.network.layers[0].bias[:] = preferences(level.count, truth.levels[number - 1].count)
+                level.policy.network.layers[0].bias[:] = preferences(
+                    level.count, truth.levels[number - 1].count
+                )
             level.termination.layers[0].weight.zero_()
             level.termination.layers[0].bias[:] = ending
         truth.meta_policy.network.layers[0].weight.zero_()

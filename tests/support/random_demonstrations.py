@@ -35,4 +35,6 @@ def numbered(rows: Iterable[tuple[Any, ...]]) -> Demonstrations:
 def of_states(lengths: Iterable[int], seed: int = 0) -> Demonstrations:
     """Demonstrations of so many steps each, with a state of three numbers and a control of two."""
     random = np.random.default_rng(seed)
-    return numbered(({"state": random.normal(size=(steps, 3))}, random.normal(size=(steps, 2))) for steps in lengths)
+    return numbered(
+        ({"state": random.normal(size=(steps, 3))}, random.normal(size=(steps, 2))) for steps in lengths
+    )

@@ -68,7 +68,9 @@ class Remembering(nn.Module):
     def initial_state(self, trajectories):
         features = self.head.in_features
         state = torch.zeros(trajectories, features), torch.zeros(trajectories)
-        return {"list": list(state), "without trajectories": (torch.zeros(features), state[1])}.get(self.how, state)
+        return {"list": list(state), "without trajectories": (torch.zeros(features), state[1])}.get(
+            self.how, state
+        )
 
     def forward(self, inputs, state):
         total, steps = state
@@ -96,7 +98,9 @@ class WithMemory(nn.Module):
         super().__init__()
         self.how, self.size = how, (copies, outputs)
         self.lstm = nn.LSTM(shape.vector, 16, batch_first=how != "over trajectories")
-        self.head = nn.Linear(16 if how in ("over time", "over trajectories") else shape.vector, copies * outputs)
+        self.head = nn.Linear(
+            16 if how in ("over time", "over trajectories") else shape.vector, copies * outputs
+        )
 
     def forward(self, inputs):
         features = {

@@ -46,7 +46,7 @@ def test_the_nearest_rotation_is_the_polar_factor_or_beats_all_others() -> None:
             np.testing.assert_allclose(nearest, linalg.polar(matrix)[0], atol=1e-12)
 
 
-# --- the shape of a load ----------------------------------------------------------------------------------------------
+# --- the shape of a load ------------------------------------------------------------------------------------
 
 
 def numbers(mask: np.ndarray) -> dict[str, float]:
@@ -59,7 +59,9 @@ def test_a_bar(turned: bool) -> None:
     mask = np.zeros((40, 40), np.uint8)
     mask[4:7, 10:31] = 255
     found = numbers(mask.T if turned else mask)
-    across, along = ((size**2 - 1) / 12 * 63 / 62 for size in (3, 21))  # variances of a sample of evenly spaced places
+    across, along = (
+        (size**2 - 1) / 12 * 63 / 62 for size in (3, 21)
+    )  # variances of a sample of evenly spaced places
     rows, columns = [4, 5, 6], [10, 20, 30]
     (top, row, bottom), (left, column, right) = (columns, rows) if turned else (rows, columns)
     expected = {

@@ -50,7 +50,9 @@ def test_forward_kinematics_is_mujocos(environment: Environment) -> None:
     low, high = pushing_geometry.JOINT_RANGES.T
     for angles in np.random.default_rng(0).uniform(low, high, (20, 3)):
         arrange(environment, angles, 0.0, 0.3)
-        np.testing.assert_allclose(pushing_geometry.tip_position(angles), environment.physics.tip(), atol=1e-9)
+        np.testing.assert_allclose(
+            pushing_geometry.tip_position(angles), environment.physics.tip(), atol=1e-9
+        )
 
 
 def test_inverse_kinematics_is_the_inverse() -> None:

@@ -1,4 +1,5 @@
-"""Networks on a device, everything else on the host; the same fit wherever that is, and a clear line where it is not.
+"""Networks on a device, everything else on the host; the same fit wherever that is, and a clear line where it
+is not.
 
 Without a GPU a double stands for one: it computes here, and refuses what a GPU would refuse.
 """
@@ -27,9 +28,11 @@ from ddco_pyro.training import processes
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import OtherDevice
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*to a meta parameter:UserWarning")  # the double is called meta
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*to a meta parameter:UserWarning"
+)  # the double is called meta
 
-# --- a double: tensors that say they are on ``THERE``, have their numbers here, and mix with no others ----------------
+# --- a double: tensors that say they are on ``THERE``, have their numbers here, and mix with no others ------
 
 THERE = torch.device("meta")
 """What the double calls itself: a device that torch knows, and that needs no driver."""
@@ -86,7 +89,7 @@ def _run(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     return tree_map(back, operation(*args, **kwargs))
 
 
-# --- the fits ---------------------------------------------------------------------------------------------------------
+# --- the fits -----------------------------------------------------------------------------------------------
 
 USERS = ("networks", "checkpoint", "restarts", "loop")
 """Who asks for the device of a spec."""
@@ -102,7 +105,11 @@ MLP = {"network": "mlp", "hidden": [6], "inputs": ["pose"]}
 LINEAR = {"network": "linear", "inputs": ["pose"]}
 LSTM = {"network": "lstm", "over": {"network": "mlp", "hidden": [4], "inputs": ["pose"]}, "hidden": 3}
 TIMES = {"network": "per_timestep", "hidden": [4], "inputs": ["pose"]}
-BRANCHES = {"network": "branches", "of": {"camera": MEANS, "pose": {"network": "mlp", "hidden": [3]}}, "hidden": [4]}
+BRANCHES = {
+    "network": "branches",
+    "of": {"camera": MEANS, "pose": {"network": "mlp", "hidden": [3]}},
+    "hidden": [4],
+}
 SAME = {"mlp": {"policy": MLP, "termination": LINEAR}}
 """Those of which a double computes every number as the host does."""
 
@@ -155,11 +162,13 @@ def weights(fit: ddco_pyro.Fit) -> dict[str, np.ndarray]:
     return {name: value.detach().cpu().numpy() for name, value in fit.hierarchy.state_dict().items()}
 
 
-# --- networks there, everything else here -----------------------------------------------------------------------------
+# --- networks there, everything else here -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("network", ALL)
-def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_with_networks_elsewhere(
+    demos: Demonstrations, network: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each tensor that meets another is asked for its device; weights and numbers are those of a fit on the host."""
     spec = spec_of(
         (SAME | OTHER)[network],
@@ -171,7 +180,9 @@ def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monk
     on(monkeypatch, THERE)
     with Device():
         there = ddco_pyro.fit(spec, demos)
-        placed = [parameter for module in there.hierarchy.networks().values() for parameter in module.parameters()]
+        placed = [
+            parameter for module in there.hierarchy.networks().values() for parameter in module.parameters()
+        ]
         assert placed
         assert all(isinstance(parameter.data, Elsewhere) for parameter in placed)
         others = {id(parameter) for parameter in there.hierarchy.parameters()} - set(map(id, placed))
@@ -189,7 +200,7 @@ def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monk
     assert each[0] == pytest.approx(each[1], rel=0 if network in SAME else 1e-3)
 
 
-# --- what is said -----------------------------------------------------------------------------------------------------
+# --- what is said -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -198,7 +209,10 @@ def test_no_gpu_is_one_line(demos: Demonstrations, tmp_path) -> None:
     data = json.loads(spec_of(SAME["mlp"], device="cuda").model_dump_json(by_alias=True))
     data["demonstrations"]["path"] = str(tmp_path / "demos.hdf5")
     (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data))
-    for command in (["fit", tmp_path / "spec.yaml", "--out", tmp_path / "run"], ["check", tmp_path / "spec.yaml"]):
+    for command in (
+        ["fit", tmp_path / "spec.yaml", "--out", tmp_path / "run"],
+        ["check", tmp_path / "spec.yaml"],
+    ):
         refused(f": training.device: cuda: torch {torch.__version__} has no GPU here", *command)
     assert not (tmp_path / "run").exists()
     assert "networks: on cpu" in done("check", tmp_path / "spec.yaml", "--set", "training.device=auto").out
@@ -216,7 +230,9 @@ def test_of_several_gpus_each_process_has_its_own(monkeypatch: pytest.MonkeyPatc
     assert processes.device_of(spec_of(SAME["mlp"]).training) == torch.device("cpu")
 
 
-def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_goes_on_where_it_was_begun(
+    demos: Demonstrations, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On the same kind of device bit for bit; on another it is refused before a bit is trained."""
     spec = spec_of(DROPPING, starts=["random"])
     on(monkeypatch, THERE)
@@ -225,7 +241,9 @@ def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monke
         with pytest.raises(KeyboardInterrupt):
             ddco_pyro.fit(spec, demos, tmp_path / "killed", on_event=Interrupting(2))
     on(monkeypatch, torch.device("cpu"))
-    with pytest.raises(OtherDevice, match=r"restart-0.safetensors: was trained on meta, and networks are on cpu here"):
+    with pytest.raises(
+        OtherDevice, match=r"restart-0.safetensors: was trained on meta, and networks are on cpu here"
+    ):
         ddco_pyro.fit(spec, demos, tmp_path / "killed")
     on(monkeypatch, THERE)
     with Device():
@@ -248,7 +266,7 @@ def test_a_fit_leaves_generators_as_they_were(demos: Demonstrations, monkeypatch
     assert torch.equal(torch.get_rng_state(), before)
 
 
-# --- a GPU ------------------------------------------------------------------------------------------------------------
+# --- a GPU --------------------------------------------------------------------------------------------------
 
 gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch has no GPU here")
 

@@ -117,7 +117,9 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
     assert np.diff(values).min() > -1e-9 * abs(values[-1])
     assert values[-1] > values[0] + 1
     value = penalised(model, in_double(batch), ridge)
-    learned = [(name, one) for name, one in model.named_parameters() if one.numel()]  # a constant has no weights
+    learned = [
+        (name, one) for name, one in model.named_parameters() if one.numel()
+    ]  # a constant has no weights
     free = [(name, one) for name, one in learned if "raw" not in name or not _at_floor(model, name)]
     gradients = torch.autograd.grad(value, [one for _, one in free])
     for (name, _), gradient in zip(free, gradients, strict=True):
@@ -126,9 +128,11 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
 
 
 def baum_welch(weights, start, ends):
-    """Initial and later choices and ends of an HMM, as numpy's forward-backward expects them of log-densities [T, K].
+    """Initial and later choices and ends of an HMM, as numpy's forward-backward expects them of log-densities
+    [T, K].
 
-    An option that ends may be selected again: A = diag(1 - ψ) + ψ η^T, and η is also the distribution of the first.
+    An option that ends may be selected again: A = diag(1 - ψ) + ψ η^T, and η is also the distribution of the
+    first.
     """
     stay, switch = np.diag(1 - ends), np.outer(ends, start)
     selected, ended, active, total = np.zeros_like(start), np.zeros_like(ends), np.zeros_like(ends), 0.0
@@ -152,7 +156,9 @@ def baum_welch(weights, start, ends):
 def test_constant_gates_and_terminations_are_the_hidden_markov_model_that_baum_welch_fits():
     """Beside policies that read; by numpy: the likelihood, and at its maximum the fixed point of Baum and Welch."""
     model, batch = linear((3,), above=CONSTANT, std=LEARNED).double(), batch_for(None, 20, 12)
-    skills = (torch.arange(12) + torch.arange(20)[:, None]) // torch.tensor([5, 3, 2]).repeat(7)[:20, None] % 3
+    skills = (
+        (torch.arange(12) + torch.arange(20)[:, None]) // torch.tensor([5, 3, 2]).repeat(7)[:20, None] % 3
+    )
     batch = Batch(batch.inputs, batch.actions + skills[..., None], batch.lengths)
     expectation(model, RidgeSpec(gate=7.0), batch)  # ridges are of weights: constants have none
     (policy,), gate = model.option_levels(), model.meta_policy.network.layers[0].bias[0, 0].detach()
@@ -183,7 +189,9 @@ def test_levels_are_discovered_under_a_uniform_meta_policy(discovering):
     levels = tuple(f"levels.{level}." for level in range(discovering))
     there = [(name, one) for name, one in model.named_parameters() if name.startswith(levels)]
     assert len(there) == 5 * discovering - (discovering == 2)  # the second level has no σ
-    gradients = torch.autograd.grad(penalised(model, in_double(batch), ridge, discovering), [one for _, one in there])
+    gradients = torch.autograd.grad(
+        penalised(model, in_double(batch), ridge, discovering), [one for _, one in there]
+    )
     for (name, _), gradient in zip(there, gradients, strict=True):
         assert gradient.abs().max() < 2e-2, name
 
@@ -284,9 +292,17 @@ def em_spec(**training):
 def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     fit = ddco_pyro.fit(em_spec(), demonstrations(12))
     trained = fit.metrics.trainings
-    assert {name: one.by_em for name, one in trained.items()} == {"ddco": True, "mixture": True, "flat": False}
+    assert {name: one.by_em for name, one in trained.items()} == {
+        "ddco": True,
+        "mixture": True,
+        "flat": False,
+    }
     assert trained["ddco"].spent.gradient_steps == trained["ddco"].spent.epochs
-    assert {name: one.by_lbfgs for name, one in trained.items()} == {"ddco": False, "mixture": False, "flat": True}
+    assert {name: one.by_lbfgs for name, one in trained.items()} == {
+        "ddco": False,
+        "mixture": False,
+        "flat": True,
+    }
     assert trained["flat"].spent.gradient_steps == trained["flat"].spent.epochs
     assert "(EM)" in verdicts.effort(trained["ddco"])
     assert "(L-BFGS)" in verdicts.effort(trained["flat"])
@@ -338,8 +354,8 @@ def test_linear_networks_are_trained_by_em_unless_the_spec_asks_for_gradient_ste
 
 
 def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
-    """One tuning demonstration likes the beginning of a stage better than its end, where few train; segments then get
-    lost.
+    """One tuning demonstration likes the beginning of a stage better than its end, where few train; segments
+    then get lost.
     """
     spec, demos = em_spec(starts=["vq_controls"], epochs=None, patience=3), demonstrations(9)
     train_with, histories = demos.select(demos.names[:6]), []
@@ -372,7 +388,8 @@ def bimanual(number=20, steps=60, seed=0):
 
 
 def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(tmp_path):
-    """As ``init`` writes it, a fit to two arms is far better held out; where demonstrations are many, nothing changes.
+    """As ``init`` writes it, a fit to two arms is far better held out; where demonstrations are many, nothing
+    changes.
 
     By the spec's own ridge the same fit falls apart, and says so.
     """
@@ -383,7 +400,13 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
         spec = parse_spec(yaml.safe_load(starting_spec(inspect(path), path).text))
         return ddco_pyro.fit(
             with_overrides(
-                spec, {"compare_with": [], "training.epochs": 16, "training.starts": ["vq_controls"], **dict(overrides)}
+                spec,
+                {
+                    "compare_with": [],
+                    "training.epochs": 16,
+                    "training.starts": ["vq_controls"],
+                    **dict(overrides),
+                },
             )
         ).metrics
 
@@ -396,7 +419,9 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
     assert held.log_likelihood_per_step.valid > fallen.log_likelihood_per_step.valid + 50
 
 
-@pytest.mark.parametrize(("number", "parts", "ridge"), [(1, None, 2.0), (6, None, 0.0), (6, ACTIONS[:1], 2.0)])
+@pytest.mark.parametrize(
+    ("number", "parts", "ridge"), [(1, None, 2.0), (6, None, 0.0), (6, ACTIONS[:1], 2.0)]
+)
 def test_a_ridge_stays_where_nothing_can_be_left_out(number, parts, ridge):
     """Of a single demonstration, without a ridge, and where no control is continuous."""
     model, batch = linear((2,), parts), batch_for(parts)

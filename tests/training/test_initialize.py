@@ -67,7 +67,9 @@ def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
     objective = Objective(material, Progress(0), plan(spec, 1)[0])
     known = [int(name.removeprefix("demo_")) for name in material.names]
     truths = np.concatenate([np.split(truth[found], cuts)[number] for number in known])
-    assert adjusted_rand_score(truths, alive(objective.known[0][1], [LENGTHS[number] for number in known])) == 1
+    assert (
+        adjusted_rand_score(truths, alive(objective.known[0][1], [LENGTHS[number] for number in known])) == 1
+    )
 
 
 FEW = (3, 2, 4)
@@ -79,8 +81,8 @@ def scatter(rows, labels):
 
 
 def assert_k_means(rows, choices, clusters):
-    """Every row is nearest to its own cluster's mean, and no way to part the rows scatters much less (k-means tries ten
-    starts and finds the best or nearly so).
+    """Every row is nearest to its own cluster's mean, and no way to part the rows scatters much less (k-means
+    tries ten starts and finds the best or nearly so).
     """
     means = np.stack([rows[choices == k].mean(0) for k in range(1, clusters + 1)])
     np.testing.assert_array_equal(np.linalg.norm(rows[:, None] - means, axis=-1).argmin(1) + 1, choices)
@@ -118,7 +120,9 @@ def test_images_are_seen_as_block_means():
 @pytest.mark.filterwarnings("error")
 def test_there_are_no_more_clusters_than_distinct_observations():
     place = np.arange(sum(LENGTHS)) % 3
-    batch = make_batch(np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])[place], random_rows(1, 2))
+    batch = make_batch(
+        np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])[place], random_rows(1, 2)
+    )
     assert adjusted_rand_score(place, alive(Clusters(batch, 5, seed=0).choices(batch))) == 1
     assert set(alive(Clusters(batch, 5, seed=0, controls=True).choices(batch))) == {1, 2, 3, 4, 5}
 

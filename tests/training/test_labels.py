@@ -9,7 +9,17 @@ import pytest
 import torch
 from command_line import call, done
 from oracle import brute_force, paths
-from planted import CONTROL, LINEAR, in_units_of, make_spec, make_trainer, make_truth, plant, small_spec, tabulated
+from planted import (
+    CONTROL,
+    LINEAR,
+    in_units_of,
+    make_spec,
+    make_trainer,
+    make_truth,
+    plant,
+    small_spec,
+    tabulated,
+)
 from random_demonstrations import numbered
 from sklearn.metrics import normalized_mutual_info_score
 
@@ -65,7 +75,7 @@ def options(labels):
     return [{5: 1, 9: 2}.get(label, -1) for label in labels]
 
 
-# --- what is maximised ------------------------------------------------------------------------------------------------
+# --- what is maximised --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("counts", "level"), [((2,), 1), ((2, 2), 1), ((2, 2), 2)])
@@ -97,23 +107,30 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
 
 
 def test_the_label_wins_over_the_cluster():
-    demos = random_demonstrations([[7, -1, 3, 3], [-1, 3, -1, -1], [3, 7, 7, -1], [-1, -1, -1, 7], [7, -1, -1, -1]])
+    demos = random_demonstrations(
+        [[7, -1, 3, 3], [-1, 3, -1, -1], [3, 7, 7, -1], [-1, -1, -1, 7], [7, -1, -1, -1]]
+    )
     material = make(labelled(), demos)
     objective = Objective(material, Progress(0), plan(material.spec, 1)[0])
-    for known, names in zip(objective.known, (material.names, set(demos.names) - set(material.names)), strict=True):
+    for known, names in zip(
+        objective.known, (material.names, set(demos.names) - set(material.names)), strict=True
+    ):
         for choices, demo in zip(known[1].tolist(), demos.select(names), strict=True):
             for choice, label in zip(choices, demo.labels["phase"].tolist(), strict=True):
                 assert choice == {3: 1, 7: 2}.get(label, choice)
                 assert choice in (1, 2)
 
 
-# --- which labels are used --------------------------------------------------------------------------------------------
+# --- which labels are used ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
-        ([[0, 1, 2], [0, 1, 2]], r"labels/phase has 3 labels from 0 on \(0, 1, 2\), but level 'level-1' has 2 options"),
+        (
+            [[0, 1, 2], [0, 1, 2]],
+            r"labels/phase has 3 labels from 0 on \(0, 1, 2\), but level 'level-1' has 2 options",
+        ),
         ([[-1, -1], [-1, -1]], "labels/phase is -1 at every step of the demonstrations to train with"),
     ],
 )
@@ -124,7 +141,7 @@ def test_labels_that_cannot_be_used_are_one_line(labels, message):
     assert "\n" not in str(caught.value)
 
 
-# --- clusters ---------------------------------------------------------------------------------------------------------
+# --- clusters -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
@@ -147,7 +164,9 @@ def test_labels_of_every_option_name_the_other_steps():
         [along, np.select([truth == 1, truth == 2], [0.0, 1.0], 9.0) + 0.1 * random.normal(size=400)]
     )
     labels = np.where((along > 0) | (np.arange(400) > 200), -1, truth)  # of the near half of the first ones
-    labels[np.flatnonzero(truth == 2)[:3]] = 2  # and of a few others, so that the means are apart along the way
+    labels[np.flatnonzero(truth == 2)[:3]] = (
+        2  # and of a few others, so that the means are apart along the way
+    )
     means = np.stack([states[labels == option].mean(0) for option in (1, 2, 3)])
     nearest = np.linalg.norm(states[:, None] - means, axis=-1).argmin(1) + 1
     assert (nearest == truth).mean() < 0.9
@@ -163,7 +182,7 @@ def clustered(states, count, labels):
     return Clusters(batch, count, seed=0, labels=torch.tensor([list(labels)])).choices(batch)[0].numpy()
 
 
-# --- a recogniser of labelled steps -----------------------------------------------------------------------------------
+# --- a recogniser of labelled steps -------------------------------------------------------------------------
 
 RECOGNISER = {"weight": 0.7, "ridge": 3.0}
 WIDTHS = 1, 2
@@ -172,7 +191,9 @@ WIDTHS = 1, 2
 
 def window(rows, width, past=False):
     """Means over windows that are cut at the ends, one after another."""
-    return np.stack([rows[max(t - width, 0) : t + 1 + (0 if past else width)].mean(0) for t in range(len(rows))])
+    return np.stack(
+        [rows[max(t - width, 0) : t + 1 + (0 if past else width)].mean(0) for t in range(len(rows))]
+    )
 
 
 def features(demo, mean=None):
@@ -226,7 +247,9 @@ def test_it_is_the_regression_of_scikit_learn_on_windows(recognised, past):
     for demo, own in zip(demos, ratio.numpy(), strict=True):
         expected = np.maximum(truth.predict_log_proba(features(demo, mean)), -12) - np.log(share)
         np.testing.assert_allclose(own[: len(demo), 1:3], expected, atol=1e-4)
-        np.testing.assert_array_equal(own[: len(demo), [0, 3]], 0.0)  # of control, and of the option without labels
+        np.testing.assert_array_equal(
+            own[: len(demo), [0, 3]], 0.0
+        )  # of control, and of the option without labels
 
 
 def test_evidence_is_a_factor_of_every_path(recognised):
@@ -253,7 +276,9 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
 
     def one(number):
         phase = np.repeat([0, 1, 0, 1], random.integers(12, 18, 4))
-        fast = np.sin(np.arange(len(phase)) * np.where(phase, 2.4, 0.3))[:, None] + random.normal(size=(len(phase), 1))
+        fast = np.sin(np.arange(len(phase)) * np.where(phase, 2.4, 0.3))[:, None] + random.normal(
+            size=(len(phase), 1)
+        )
         drift = np.where(phase, 1.0, -1.0)[:, None] + 1.5 * random.normal(size=(len(phase), 1))
         known = phase if number < 3 else np.full_like(phase, -1)
         return (
@@ -269,7 +294,9 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
         labels = {"level": "level-1", "from": "known", **({"recogniser": own} if own else {})}
         training = {"optimizer": {"name": "em"}, "labels": labels, "epochs": 40}
         read = {"path": "unused.hdf5", "labels": "phase"}
-        spec = small_spec((2,), training=training, demonstrations=read, compare_with=["mixture"] if own else [])
+        spec = small_spec(
+            (2,), training=training, demonstrations=read, compare_with=["mixture"] if own else []
+        )
         fit = ddco_pyro.fit(spec, train, out=tmp_path / name)
         paths = [*fit.segment(held_out)[0]]
         truth = [demo.labels["phase"] + 1 for demo in held_out]
@@ -285,7 +312,11 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
         np.testing.assert_array_equal(own, other)
     mixture = again.baselines["mixture"]
     shared = mixture.spec.training.labels.recogniser
-    assert (mixture.spec.control.power, shared.weight, shared.ridge) == (chosen.power, chosen.weight, chosen.ridge)
+    assert (mixture.spec.control.power, shared.weight, shared.ridge) == (
+        chosen.power,
+        chosen.weight,
+        chosen.ridge,
+    )
     assert float(mixture.hierarchy.recogniser.gamma) == chosen.weight
     said = contributions(again.metrics.training)
     assert max(map(sum, said.values())) == sum(said["labels, recogniser and policies, as chosen"])
@@ -308,7 +339,11 @@ def test_a_recogniser_reads_pictures():
         return seen, random.normal(size=(len(phase), 2)), {"phase": known, "truth": phase}
 
     demos = numbered(one(number) for number in range(6))
-    conv = {"network": "conv", "layers": [{"filters": 2, "kernel": 3, "stride": 2, "padding": 1}], "hidden": [3]}
+    conv = {
+        "network": "conv",
+        "layers": [{"filters": 2, "kernel": 3, "stride": 2, "padding": 1}],
+        "hidden": [3],
+    }
     labels = {"level": "level-1", "from": "phase", "recogniser": RECOGNISER}
     seen = ["state", "camera"]
     level = {"name": "level-1", "count": 2, "policy": conv, "termination": {**LINEAR, "inputs": ["state"]}}
@@ -319,13 +354,15 @@ def test_a_recogniser_reads_pictures():
     features = reads.features(batch.inputs, batch.actions, batch.lengths)
     found = model.recogniser.options(batch)
     for demo, rows, options in zip(demos, features.numpy(), found.numpy(), strict=True):
-        brightness = demo.observations["camera"].reshape(len(demo), 8, 8, 2).mean(-1).reshape(len(demo), 64) / 255
+        brightness = (
+            demo.observations["camera"].reshape(len(demo), 8, 8, 2).mean(-1).reshape(len(demo), 64) / 255
+        )
         np.testing.assert_allclose(rows[: len(demo), 2:66], brightness, atol=1e-6)
         np.testing.assert_allclose(rows[: len(demo), 70:134], window(brightness, 2), atol=1e-6)
         assert (options[: len(demo)] == demo.labels["truth"] + 1).mean() > 0.9
 
 
-# --- planted options --------------------------------------------------------------------------------------------------
+# --- planted options ----------------------------------------------------------------------------------------
 
 
 def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
@@ -338,7 +375,9 @@ def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
     demos, choices = plant(truth, 30, 24, seed=1)
     phases = np.array(names)[choices[..., 0].numpy() - 1]
     phases[3:] = -1
-    demos = Demonstrations(tuple(replace(demo, labels={"phase": row}) for demo, row in zip(demos, phases, strict=True)))
+    demos = Demonstrations(
+        tuple(replace(demo, labels={"phase": row}) for demo, row in zip(demos, phases, strict=True))
+    )
     held_out, true = plant(truth, 20, 24, seed=11)
     model = make_trainer(in_units_of(spec, demos), demos, tmp_path).run()
     tables, batch = tabulated(model, held_out)
@@ -348,7 +387,7 @@ def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
     assert (found.numpy() == number[true[..., 0] - 1]).mean() > 0.98
 
 
-# --- the spec, the run and what is said of it -------------------------------------------------------------------------
+# --- the spec, the run and what is said of it ---------------------------------------------------------------
 
 
 @pytest.fixture
@@ -380,7 +419,10 @@ def test_a_start_that_does_not_follow_labels_is_warned_of(files, start):
 
 def test_a_run_says_for_which_labels_its_options_stand(files):
     output = call("check", files / "mine.yaml").out
-    assert "labels/phase, level 'skill': phase 0 is option 1, phase 2 is option 2; used of 3 demonstrations" in output
+    assert (
+        "labels/phase, level 'skill': phase 0 is option 1, phase 2 is option 2; used of 3 demonstrations"
+        in output
+    )
     call("fit", files / "mine.yaml", "--out", files / "run")
     said = json.loads((files / "run" / "metrics.json").read_text())["trained_labels"]
     assert (said["level"], said["labels"], said["values"]) == ("skill", "phase", [0, 2])
@@ -405,10 +447,12 @@ def test_a_run_says_for_which_labels_its_options_stand(files):
         assert "(option 3)" not in text
 
 
-# --- labels of several levels -----------------------------------------------------------------------------------------
+# --- labels of several levels -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("labels", "names"), [(["phase", "half"], ["phase", "half"]), ("half", ["half", "half"])])
+@pytest.mark.parametrize(
+    ("labels", "names"), [(["phase", "half"], ["phase", "half"]), ("half", ["half", "half"])]
+)
 def test_each_level_is_measured_with_its_own_labels(tmp_path, labels, names):
     random, phase = np.random.default_rng(0), np.repeat([0, 1, 2, 3], 4)
     own = {"phase": phase, "half": np.where(np.arange(16) == 8, -1, phase // 2)}
@@ -430,4 +474,6 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, labels, names):
     demos.write(tmp_path / "demos.hdf5")
     done("segment", fit.folder, tmp_path / "demos.hdf5", "--html", tmp_path / "page.html")
     shown = (tmp_path / "page.html").read_text()
-    assert [shown.count(f"Agreement with the label “{name}”") for name in names] == [names.count(one) for one in names]
+    assert [shown.count(f"Agreement with the label “{name}”") for name in names] == [
+        names.count(one) for one in names
+    ]

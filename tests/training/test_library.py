@@ -56,7 +56,9 @@ def test_a_linear_policy_ends_at_ridge_regression_centred_at_the_library(per_opt
     batch = make_batch(6, 9)
     converged(Expectation(model, EVERYTHING, score, RidgeSpec(), prior=Prior(library, 30.0, 20.0)), batch)
     alive = torch.arange(9) < batch.lengths[:, None]
-    x = np.column_stack([batch.inputs.vectors["state"][alive].numpy(), np.ones(int(alive.sum()))]).astype(float)
+    x = np.column_stack([batch.inputs.vectors["state"][alive].numpy(), np.ones(int(alive.sum()))]).astype(
+        float
+    )
     actions = batch.actions[alive].double().numpy()
     (layer,), (center,) = (one.meta_policy.network.layers for one in (model, library))
     w0 = torch.cat([center.weight, center.bias], 1)[0].detach().double().numpy()
@@ -79,18 +81,28 @@ def test_without_a_prior_of_sigma_it_collapses():
     found = {}
     for spread in (1e-9, 20.0):
         model = copy.deepcopy(library)
-        converged(Expectation(model, EVERYTHING, score, RidgeSpec(), prior=Prior(library, 1000.0, spread)), batch)
+        converged(
+            Expectation(model, EVERYTHING, score, RidgeSpec(), prior=Prior(library, 1000.0, spread)), batch
+        )
         found[spread] = float(model.meta_policy.std.table().detach().max())
     assert found[1e-9] < 0.02  # the floor is 0.01
     assert found[20.0] > 0.2
 
 
-KINDS = {"gaussian": None, "clipped": CLIPPED, "mixed": MIXED, "actions": ACTIONS, "student": STUDENT, "hurdle": HURDLE}
+KINDS = {
+    "gaussian": None,
+    "clipped": CLIPPED,
+    "mixed": MIXED,
+    "actions": ACTIONS,
+    "student": STUDENT,
+    "hurdle": HURDLE,
+}
 
 
 @pytest.mark.parametrize("parts", KINDS.values(), ids=KINDS)
 @pytest.mark.parametrize(
-    ("counts", "std"), [((2, 3), LEARNED), ((2,), LEARNED | {"per_option": True}), ((), LEARNED | {"per_state": True})]
+    ("counts", "std"),
+    [((2, 3), LEARNED), ((2,), LEARNED | {"per_option": True}), ((), LEARNED | {"per_state": True})],
 )
 def test_em_has_the_prior_of_the_program(parts, std, counts):
     """Differences between two models: densities have constants of their own."""
@@ -119,7 +131,9 @@ def test_the_program_with_likelihood_has_em_s_objective():
 
 def planted(**training):
     """A library's truth of four corners, and a new task whose two first corners lie nearer."""
-    spec = with_overrides(make_spec((4,), control=CONTROL), {"training.optimizer": {"name": "em"}, **training})
+    spec = with_overrides(
+        make_spec((4,), control=CONTROL), {"training.optimizer": {"name": "em"}, **training}
+    )
     library, new = make_truth(spec), make_truth(spec)
     with torch.no_grad():
         new.levels[0].policy.network.layers[0].bias[:2] *= 0.7
@@ -147,7 +161,9 @@ def test_a_ridge_of_0_leaves_the_weights_alone():
     """They begin by `starts`; encoder, scaling and the prior of σ are the library's."""
     spec, library, truth = planted()
     demos, _ = plant(truth, 4, 30, seed=1)
-    spec = with_overrides(spec, {"training.library": {"run": "known", "ridge": 0, "spread": 5}, "training.epochs": 20})
+    spec = with_overrides(
+        spec, {"training.library": {"run": "known", "ridge": 0, "spread": 5}, "training.epochs": 20}
+    )
     trainer = Trainer(spec, Dimensions.of(demos), demos, demos, library=Prior(library, 0.0, 5.0))
     trainer.check_engines()
     trainer.run()
@@ -159,8 +175,12 @@ def test_a_ridge_of_0_leaves_the_weights_alone():
 
 def test_perceptrons_end_where_likelihood_and_prior_balance():
     """The gradient of their sum is 0 at the end of L-BFGS, whose own weights have moved."""
-    spec = small_spec((), {"network": "mlp", "hidden": [4]}, training={"optimizer": {"name": "em"}, "epochs": 400})
-    spec = with_overrides(spec, {"training.tune_fraction": 0, "control.std": LEARNED, "training.patience": None})
+    spec = small_spec(
+        (), {"network": "mlp", "hidden": [4]}, training={"optimizer": {"name": "em"}, "epochs": 400}
+    )
+    spec = with_overrides(
+        spec, {"training.tune_fraction": 0, "control.std": LEARNED, "training.patience": None}
+    )
     demos, _ = plant(planted()[1], 6, 20, seed=1)
     size = Dimensions.of(demos)
     library = train_model(spec, size, demos).hierarchy

@@ -48,7 +48,7 @@ def demos():
     return of_states(np.random.default_rng(0).integers(4, 9, 10).tolist())
 
 
-# --- a gradient from shards -------------------------------------------------------------------------------------------
+# --- a gradient from shards ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("rows", "dtype", "close"), [(8, torch.float32, 1e-6), (3, torch.float64, 1e-12)])
@@ -74,7 +74,7 @@ def test_the_gradient_of_four_shards_is_that_of_one(demos, rows, dtype, close):
         torch.testing.assert_close(shared, gradient, rtol=close, atol=close * largest)
 
 
-# --- the command line -------------------------------------------------------------------------------------------------
+# --- the command line ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -211,14 +211,16 @@ def test_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path, number, tra
 
 
 def test_more_processes_than_shards_are_refused(whole, tmp_path):
-    first, other = under_torchrun(tmp_path, "fit", whole[0], "--set", "training.shards=1", "--out", tmp_path / "run")
+    first, other = under_torchrun(
+        tmp_path, "fit", whole[0], "--set", "training.shards=1", "--out", tmp_path / "run"
+    )
     said = "torchrun started 2 processes, but a minibatch is cut into training.shards=1; add --set training.shards=2"
     assert (first.status, first.err.count("\n"), said in first.err) == (2, 1, True)
     assert other == (0, "", "")
     assert not (tmp_path / "run").exists()
 
 
-# --- many calls -------------------------------------------------------------------------------------------------------
+# --- many calls ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

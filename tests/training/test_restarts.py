@@ -68,11 +68,13 @@ def assert_same(trainer, model, folder, undisturbed):
     assert checkpoints(folder) == files
 
 
-# --- processes, and going on ------------------------------------------------------------------------------------------
+# --- processes, and going on --------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_same_bits_also_where_one_had_begun(undisturbed, spec, demos, tmp_path, monkeypatch):
+def test_two_processes_give_the_same_bits_also_where_one_had_begun(
+    undisturbed, spec, demos, tmp_path, monkeypatch
+):
     monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
     interrupted(make_trainer(spec, demos, tmp_path, Interrupting(5 * 3 + 2)))
     trainer = make_trainer(spec, demos, tmp_path, jobs=2)
@@ -85,7 +87,9 @@ def interrupted(trainer):
 
 
 def test_em_that_is_interrupted_begins_its_restart_again_and_gives_the_same_bits(demos, tmp_path):
-    spec = make_spec((2,), starts=["vq", "mixture"], control={"std": 1.0}, optimizer={"name": "em"}, epochs=20)
+    spec = make_spec(
+        (2,), starts=["vq", "mixture"], control={"std": 1.0}, optimizer={"name": "em"}, epochs=20
+    )
     whole = trained(spec, demos, tmp_path / "whole")
     for epochs in (3, 30):
         folder = tmp_path / str(epochs)
@@ -94,7 +98,7 @@ def test_em_that_is_interrupted_begins_its_restart_again_and_gives_the_same_bits
         assert_same(again, again.run().state_dict(), folder, whole)
 
 
-# --- which is kept ----------------------------------------------------------------------------------------------------
+# --- which is kept ------------------------------------------------------------------------------------------
 
 
 class Scripted:
@@ -119,7 +123,9 @@ ENDED = {"stage": "joint", "epochs": 20, "cap": None, "rising": 0.0, "over": 1, 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_those_far_behind_are_stopped_and_the_likeliest_of_the_others_is_kept(demos, tmp_path, monkeypatch, seed):
+def test_those_far_behind_are_stopped_and_the_likeliest_of_the_others_is_kept(
+    demos, tmp_path, monkeypatch, seed
+):
     random = np.random.default_rng(seed)
     number, margin = int(random.integers(2, 7)), float(random.choice([0.0, 0.02]))
     sounded, ends = random.normal(0, 0.02, (2, number)).round(3)
@@ -138,7 +144,9 @@ def test_those_far_behind_are_stopped_and_the_likeliest_of_the_others_is_kept(de
     restarts = trainer.summary["restarts"]
     assert restarts["best"] == expected
     assert [each["start"] for each in restarts["each"]] == starts
-    assert [each["objective"] for each in restarts["each"]] == [None if n in behind else ends[n] for n in range(number)]
+    assert [each["objective"] for each in restarts["each"]] == [
+        None if n in behind else ends[n] for n in range(number)
+    ]
     kept = trainer.data.hierarchy(expected).state_dict()
     assert all(torch.equal(model[name], value) for name, value in kept.items())
 
@@ -151,9 +159,18 @@ def test_the_objective_has_the_ridges_log_prior(demos, tmp_path):
     trainer = make_trainer(spec, demos, tmp_path)
     model, batch = trainer.run(), trainer.data.train
     (level,) = model.option_levels()
-    networks = [("policy", level.policy.network), ("gate", level.termination), ("gate", model.meta_policy.network)]
-    squares = [(name, float(network.layers[-1].weight.detach().double().square().sum())) for name, network in networks]
-    biases = 1e-6 * sum(float(network.layers[-1].bias.detach().double().square().sum()) for _, network in networks)
+    networks = [
+        ("policy", level.policy.network),
+        ("gate", level.termination),
+        ("gate", model.meta_policy.network),
+    ]
+    squares = [
+        (name, float(network.layers[-1].weight.detach().double().square().sum()))
+        for name, network in networks
+    ]
+    biases = 1e-6 * sum(
+        float(network.layers[-1].bias.detach().double().square().sum()) for _, network in networks
+    )
     value = float(log_likelihood(model.tabulate(batch), batch.lengths).detach().sum())
     value -= 0.5 * (sum(ridge[name] * square for name, square in squares) + biases)
     assert trainer.objective == pytest.approx(value / batch.steps, abs=1e-5)
@@ -193,7 +210,7 @@ def test_segments_of_restarts_are_compared_with_the_best(demos, tmp_path):
         assert number == best or f"{words.number(nmi)} of {number}" in said
 
 
-# --- restarts that diverge --------------------------------------------------------------------------------------------
+# --- restarts that diverge ----------------------------------------------------------------------------------
 
 
 def diverging(passes, **training):
@@ -207,7 +224,9 @@ def diverging(passes, **training):
 def test_a_restart_that_diverges_ends_there_and_is_not_the_best(demos, tmp_path, passes):
     trainer, model, told, _ = trained(diverging(passes), demos, tmp_path)
     ended = [number for number, each in enumerate(trainer.summary["restarts"]["each"]) if each["diverged"]]
-    starts = [trainer.data.hierarchy(number).meta_policy.network.module.weight[0, 0] > 0 for number in range(6)]
+    starts = [
+        trainer.data.hierarchy(number).meta_policy.network.module.weight[0, 0] > 0 for number in range(6)
+    ]
     rows = [sum(row["restart"] == number for row in trainer.history) for number in range(6)]
     assert ended
     assert all(starts[number] and rows[number] == passes for number in ended)
@@ -217,7 +236,9 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(demos, tmp_path,
     reasons = {event.restart: event.why for event in told if isinstance(event, RestartDiverged)}
     assert sorted(reasons) == ended
     assert all(f"epoch {passes + 1}: the log-likelihood of demo_" in why for why in reasons.values())
-    assert f"; diverged: {', '.join(map(str, ended))}" in verdicts.restarts(Training.model_validate(trainer.summary))
+    assert f"; diverged: {', '.join(map(str, ended))}" in verdicts.restarts(
+        Training.model_validate(trainer.summary)
+    )
     made = training.train(trainer.data, Restart(Progress(best)))
     assert all(torch.equal(model[name], value) for name, value in made.states["best"].items())
 
@@ -232,7 +253,9 @@ def test_where_those_that_are_left_diverge_the_stopped_ones_go_on(demos, tmp_pat
 
 @pytest.mark.parametrize("restarts", [1, 3])
 def test_where_all_diverge_the_trajectory_is_named(demos, tmp_path, monkeypatch, restarts):
-    monkeypatch.setattr(user_networks.Diverging, "forward", lambda self, inputs: _nan_in_training(self, inputs))
+    monkeypatch.setattr(
+        user_networks.Diverging, "forward", lambda self, inputs: _nan_in_training(self, inputs)
+    )
     for _ in range(2):  # also where all that is kept is read again
         with pytest.raises(
             TrainingError, match=r"^stage policy, epoch 1: the log-likelihood of demo_\d+.* is not finite"
@@ -245,7 +268,7 @@ def _nan_in_training(network, inputs):
     return found * torch.nan if network.training else found
 
 
-# --- the mixture that a hierarchy contains ----------------------------------------------------------------------------
+# --- the mixture that a hierarchy contains ------------------------------------------------------------------
 
 
 def memoryless(seed, number=12, steps=30):

@@ -1,6 +1,8 @@
-"""Observations that vary by rounding alone: `inspect` says so, `init` leaves them out, and no encoder makes them loud.
+"""Observations that vary by rounding alone: `inspect` says so, `init` leaves them out, and no encoder makes
+them loud.
 
-What rests is planted: a simulator's quaternion of an object that never turns, whose components are 1e-6 apart.
+What rests is planted: a simulator's quaternion of an object that never turns, whose components are 1e-6
+apart.
 """
 
 import json
@@ -30,7 +32,8 @@ def make_demonstrations(number: int = 6, steps: int = 20) -> Demonstrations:
             "half": np.column_stack([place[:, :1], 0.7 + noise[:, :1], random.normal(0, 1e-3, steps)]),
             "place": place,
             "distance": 1e-7 * place[:, :1],  # small, and nothing but signal
-            "settled": np.full((steps, 1), 0.3 * index) + noise[:, :1],  # differs between demonstrations alone
+            "settled": np.full((steps, 1), 0.3 * index)
+            + noise[:, :1],  # differs between demonstrations alone
         }
         observations = {key: values.astype(np.float32) for key, values in observations.items()}
         records.append((observations, np.sin(place) + random.normal(0, 0.1, (steps, 2))))
@@ -51,10 +54,25 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("low", "high", "dtype", "expected"),
     [
         ([1.0, -6e-7], [1.0, 6e-7], "float32", [True, True]),  # Meta-World's hand-insert and sweep-into
-        ([1.0, -8.6e-6], [1.0, 7.7e-6], "float64", [True, True]),  # its shelf-place, after 500 steps of a simulator
+        (
+            [1.0, -8.6e-6],
+            [1.0, 7.7e-6],
+            "float64",
+            [True, True],
+        ),  # its shelf-place, after 500 steps of a simulator
         ([1.0, -5e-5], [1.0, 5e-5], "float32", [True, False]),  # a tenth of a millimetre, or of a milliradian
-        ([-6e-7, -1e-7], [6e-7, 1e-7], "float32", [False, False]),  # nothing large beside it: a signal in small units
-        ([1e3, -1e-3], [1e3, 1e-3], "float64", [True, False]),  # of mixed units: parts of 1 count, not of 1000
+        (
+            [-6e-7, -1e-7],
+            [6e-7, 1e-7],
+            "float32",
+            [False, False],
+        ),  # nothing large beside it: a signal in small units
+        (
+            [1e3, -1e-3],
+            [1e3, 1e-3],
+            "float64",
+            [True, False],
+        ),  # of mixed units: parts of 1 count, not of 1000
         ([5e6], [5e6 + 3], "float64", [False]),  # metres in a map's coordinates
         ([5e6], [5e6 + 1], "float32", [True]),  # two units in the last place
         ([1000], [1001], "int64", [False]),  # whole numbers are not rounded
@@ -75,7 +93,10 @@ def test_inspect_says_so(path: Path) -> None:
     for key in ("place", "distance", "settled"):
         assert found.fields[f"obs/{key}"].rounding == []
     assert found.fields["actions"].rounding == []
-    rows = {line.split("│")[0].strip(): line.split("│")[-1].strip() for line in call("inspect", path).out.splitlines()}
+    rows = {
+        line.split("│")[0].strip(): line.split("│")[-1].strip()
+        for line in call("inspect", path).out.splitlines()
+    }
     assert rows["obs/resting"] == "constant up to rounding"
     assert rows["obs/half"] == "constant up to rounding: 1"
     fields = {field["place"]: field for field in json.loads(call("inspect", path, "--json").out)["fields"]}
@@ -90,7 +111,9 @@ def test_init_leaves_them_out(path: Path) -> None:
 
 def features(key: str, differences: bool = False, demos: Demonstrations = DEMOS) -> np.ndarray:
     """What networks see of an observation in all steps, [steps, F]."""
-    encoder = ObservationEncoder([ObservationSpec(key=key, differences=differences)], demos.observation_shapes)
+    encoder = ObservationEncoder(
+        [ObservationSpec(key=key, differences=differences)], demos.observation_shapes
+    )
     encoder.fit(demos)
     return encoder.inputs(demo.observations for demo in demos).vector.flatten(0, 1).numpy()
 

@@ -49,15 +49,23 @@ def test_stages_go_from_the_lowest_level_up(training, depth, names):
 
 def lines(**training):
     """Ten demonstrations along a line, cut into three equal parts, and how they are fitted."""
-    line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(0, 0.02, (10, 12, 2))
+    line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(
+        0, 0.02, (10, 12, 2)
+    )
     demos = numbered(({"state": one}, one) for one in line)
-    own = {"starts": ["equal_parts"], "layerwise": False, "optimizer": {"lr": 0.1}, "epochs": 800, "patience": None}
+    own = {
+        "starts": ["equal_parts"],
+        "layerwise": False,
+        "optimizer": {"lr": 0.1},
+        "epochs": 800,
+        "patience": None,
+    }
     return make_trainer(make_spec((3,), **own, **training), demos, None).data
 
 
 def test_a_meta_policy_that_nothing_trains_before_all_are_begins_with_its_options():
-    """Parts say which option a demonstration begins with and which one follows: before the last stage the meta-policy
-    knows it, and options last. Of when it would act itself parts say nothing.
+    """Parts say which option a demonstration begins with and which one follows: before the last stage the
+    meta-policy knows it, and options last. Of when it would act itself parts say nothing.
     """
     material, restart = lines(), Restart(Progress(0))
     train(material, restart, until=0)
@@ -84,7 +92,9 @@ def test_learning_rates_fall_along_half_a_cosine(tmp_path, monkeypatch):
 
     monkeypatch.setattr(torch.optim, "Adam", Adam)
     optimizer = {"lr": 0.01, "schedule": "cosine"}
-    trainer = make_trainer(make_spec(epochs=40, patience=None, optimizer=optimizer), of_states([8] * 10), tmp_path)
+    trainer = make_trainer(
+        make_spec(epochs=40, patience=None, optimizer=optimizer), of_states([8] * 10), tmp_path
+    )
     trainer.run()
     parameter, expected = torch.nn.Parameter(torch.zeros(1)), []
     for epochs in epochs_of(trainer).values():
@@ -153,14 +163,18 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
 
     monkeypatch.setattr(StageTraining, "step", step)
     monkeypatch.setattr(Objective, "tune", tune)
-    final = make_trainer(make_spec((), average=decay, epochs=3, batch_size=4), of_states([8] * 10), tmp_path).run()
+    final = make_trainer(
+        make_spec((), average=decay, epochs=3, batch_size=4), of_states([8] * 10), tmp_path
+    ).run()
     assert (len(steps), len(shown)) == (3 * 2, 1 + 3)
     for epoch, seen in enumerate(shown[1:], start=1):
         taken = steps[: 2 * epoch]
         last = len(taken) - 1
         for name, value in seen.items():
             mean = decay**last * taken[0][name] + sum(
-                (1 - decay) * decay ** (last - place) * step[name] for place, step in enumerate(taken) if place
+                (1 - decay) * decay ** (last - place) * step[name]
+                for place, step in enumerate(taken)
+                if place
             )
             torch.testing.assert_close(value, mean)
     assert all(torch.equal(value, shown[-1][name]) for name, value in final.named_parameters())
@@ -177,10 +191,19 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
         pytest.param("adam", {"epochs": 12, "average": 0.9}, 2 * 6 * 2, marks=pytest.mark.slow),
         ("adam", {"epochs": 12, "starts": ["equal_parts", "mixture"]}, 12 + 12),
     ],
-    ids=["adam", "momentum", "stages that stop early", "levels from segments", "mean weights", "starts that differ"],
+    ids=[
+        "adam",
+        "momentum",
+        "stages that stop early",
+        "levels from segments",
+        "mean weights",
+        "starts that differ",
+    ],
 )
 def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
-    spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, **({"starts": ["vq", "vq"]} | training))
+    spec = make_spec(
+        (2, 2), optimizer={"name": optimizer, "lr": 0.01}, **({"starts": ["vq", "vq"]} | training)
+    )
     demos = of_states([8] * 10)
     whole = make_trainer(spec, demos, tmp_path / "whole")
     expected = whole.run().state_dict()
@@ -214,7 +237,7 @@ def test_both_engines_train_to_the_same_model(tmp_path):
         torch.testing.assert_close(states[1][name], value, rtol=1e-3, atol=1e-5)
 
 
-# --- convergence ------------------------------------------------------------------------------------------------------
+# --- convergence --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -240,10 +263,14 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
     demos = numbered(({"state": state}, state @ weights + random.normal(size=(50, 2))) for state in states)
     train, tune = demos.split(0.2, 0)
     states = [
-        np.concatenate([np.column_stack([d.observations["state"], np.ones(50)]) for d in p]) for p in (train, tune)
+        np.concatenate([np.column_stack([d.observations["state"], np.ones(50)]) for d in p])
+        for p in (train, tune)
     ]
     actions = [np.concatenate([d.actions for d in p]) for p in (train, tune)]
-    error, std = actions[1] - states[1] @ np.linalg.lstsq(states[0], actions[0], rcond=None)[0], 0.5 * actions[0].std(0)
+    error, std = (
+        actions[1] - states[1] @ np.linalg.lstsq(states[0], actions[0], rcond=None)[0],
+        0.5 * actions[0].std(0),
+    )
     optimum = (-0.5 * (error / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)).sum(1).mean()
     below = {}
     for epochs in (15, 400):
@@ -255,7 +282,7 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
     assert below[False] > 10 * RISING
 
 
-# --- planted hierarchies ----------------------------------------------------------------------------------------------
+# --- planted hierarchies ------------------------------------------------------------------------------------
 
 
 EM = {"optimizer": {"name": "em"}, "epochs": 300}
@@ -272,7 +299,9 @@ def test_a_planted_hierarchy_is_recovered_from_the_likeliest_of_several_starts(t
     segments = trainer.restarts[0].states["best"], trainer.restarts[1].states["best"]
     assert any(not torch.equal(segments[0][name], segments[1][name]) for name in segments[0])
     told = trainer.summary["restarts"]
-    assert [each["nmi"] is not None for each in told["each"]] == [number != told["best"] for number in range(4)]
+    assert [each["nmi"] is not None for each in told["each"]] == [
+        number != told["best"] for number in range(4)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -293,10 +322,14 @@ def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, co
     always = {f"hierarchy.levels.{n}.termination": "always" for n in range(len(counts))}
     mixture = replace(data, spec=with_overrides(spec, always)).hierarchy(0)
     mixture.load_state_dict({name: begun[name] for name in mixture.state_dict()})
-    assert [torch.allclose(ends, torch.tensor(0.5)) for ends in psi(model, data.train)] == [True] * len(counts)
+    assert [torch.allclose(ends, torch.tensor(0.5)) for ends in psi(model, data.train)] == [True] * len(
+        counts
+    )
     without = [per_step(mixture, batch) for batch in (data.train, data.tune)]
     tuned = [row["tune"] for row in restart.progress.history if row["stage"] == "mixture"]
-    kept = tuned[-1] if optimizer["name"] == "em" else max(tuned)  # EM before the last stage keeps what converged
+    kept = (
+        tuned[-1] if optimizer["name"] == "em" else max(tuned)
+    )  # EM before the last stage keeps what converged
     assert kept == pytest.approx(without[1], abs=1e-5)
     restart = train(data, restart)
     assert restart.progress.ended[-1]["stage"] == "joint"
@@ -328,7 +361,7 @@ def test_a_planted_hierarchy_is_recovered(tmp_path, counts):
     assert values["found nmi"][0] > 0.95, values
 
 
-# --- what of the tuning demonstrations decides ------------------------------------------------------------------------
+# --- what of the tuning demonstrations decides --------------------------------------------------------------
 
 
 @pytest.mark.parametrize("number", [25, 30])

@@ -101,13 +101,16 @@ def planted_pairs(demonstrations=20, steps=40, seed=0):
     """Tables of what is seen of four options, a new one at each step; of two above, one selects 1 and 2, one 3, 4."""
     random = np.random.default_rng(seed)
     above = (
-        np.cumsum(random.random((demonstrations, steps)) < 0.1, axis=1) + random.integers(0, 2, (demonstrations, 1))
+        np.cumsum(random.random((demonstrations, steps)) < 0.1, axis=1)
+        + random.integers(0, 2, (demonstrations, 1))
     ) % 2
     seen = 2 * above + random.integers(0, 2, above.shape)
     tables = random_tables((4, 2), (False, False), demonstrations, steps)
     ended = torch.tensor([-torch.inf, 0.0], dtype=torch.float64).expand(tables.termination[0].shape)
     control = torch.where(torch.tensor(seen)[..., None] == torch.arange(4), 0.0, -5.0).double()
-    return replace(tables, termination=(ended, tables.termination[1]), control=(control, *tables.control[1:])), above
+    return replace(
+        tables, termination=(ended, tables.termination[1]), control=(control, *tables.control[1:])
+    ), above
 
 
 def test_a_planted_level_is_found():
@@ -116,7 +119,9 @@ def test_a_planted_level_is_found():
     constants = fitted([(tables, lengths)], 0)
     segments = segment(constants.within(tables), lengths)[1]
     assert normalized_mutual_info_score(above.flatten(), segments.flatten()) > 0.7
-    pairs = constants.selection[0].numpy().reshape(2, 2, 2).sum(-1)  # how often each selects 1 or 2, and 3 or 4
+    pairs = (
+        constants.selection[0].numpy().reshape(2, 2, 2).sum(-1)
+    )  # how often each selects 1 or 2, and 3 or 4
     np.testing.assert_allclose(np.sort(pairs.max(1)), 1.0, atol=0.05)
     assert pairs.argmax(1).tolist() in ([0, 1], [1, 0])
     np.testing.assert_allclose(constants.termination[0] * (1 - constants.selection[1][0]), 0.1, atol=0.04)

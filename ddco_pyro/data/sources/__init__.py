@@ -25,7 +25,8 @@ class Source:
     """A file or folder of demonstrations, open for reading.
 
     :param names: of the demonstrations, in order.
-    :param read: a demonstration by its name, as it is stored; lazy arrays can be read while the source is open.
+    :param read: a demonstration by its name, as it is stored; lazy arrays can be read while the source is
+        open.
     :param masks: name of each mask (robomimic: filter key) to names of demonstrations.
     :param frequency: control steps per second, Hz; None if unknown.
     :param attributes: facts about the whole source.
@@ -52,7 +53,8 @@ def open_source(
     """Open a file or folder.
 
     :param form: its format, of :data:`~ddco_pyro.data.formats.FORMATS`; recognised if None.
-    :param actions: names of the arrays that are the control together, where a LeRobot or Minari dataset has several.
+    :param actions: names of the arrays that are the control together, where a LeRobot or Minari dataset has
+        several.
     :param where: attributes and values of the demonstrations that the source has then; all if empty.
     :param exclude: names of demonstrations that the source has not.
     :raises DemonstrationsError: the source cannot be read, or has another format.
@@ -62,7 +64,9 @@ def open_source(
     refuse_unknown("format", form, FORMATS, DemonstrationsError, f"{path}: ")
     if actions and not FORMATS[form].parts:
         several = " or ".join(about.text for about in FORMATS.values() if about.parts)
-        raise DemonstrationsError(f"{path}: has the format {form}, with one control; --action is for {several}")
+        raise DemonstrationsError(
+            f"{path}: has the format {form}, with one control; --action is for {several}"
+        )
     reader = contextmanager(resolve_name(f"{__name__}.{FORMATS[form].reader}"))
     with reader(path, actions) if FORMATS[form].parts else reader(path) as source:
         if not source.names:
@@ -83,7 +87,9 @@ def open_own(path: Path, where: Where, exclude: Sequence[str]) -> Iterator[Sourc
         for name in exclude:
             if name not in source.names:
                 known = nearest(name, source.names)
-                raise DemonstrationsError(f"demonstrations.exclude: there is no demonstration {name!r}{known}")
+                raise DemonstrationsError(
+                    f"demonstrations.exclude: there is no demonstration {name!r}{known}"
+                )
         if set(exclude) == set(source.names):
             raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
         yield narrowed(source, where, exclude)
@@ -101,11 +107,14 @@ def narrowed(source: Source, where: Where, exclude: Sequence[str] = ()) -> Sourc
     if where:
         names = chosen({name: source.read(name).attributes for name in names}, where)
     left_out = {*source.names} - {*names}
-    masks = {mask: tuple(name for name in members if name not in left_out) for mask, members in source.masks.items()}
+    masks = {
+        mask: tuple(name for name in members if name not in left_out)
+        for mask, members in source.masks.items()
+    }
     return replace(source, names=tuple(names), masks=masks)
 
 
-# --- recognition ------------------------------------------------------------------------------------------------------
+# --- recognition --------------------------------------------------------------------------------------------
 
 
 def format_of(path: Path) -> str:
@@ -153,7 +162,10 @@ def _top_names(path: Path) -> frozenset[str]:
             names, data = frozenset(file), file.get("data")
             groups = data.values() if isinstance(data, h5py.Group) else ()
             first = next((group for group in groups if isinstance(group, h5py.Group)), ())
-            bare, prepared = "states" in first and "obs" not in first, data is not None and "env_args" in data.attrs
+            bare, prepared = (
+                "states" in first and "obs" not in first,
+                data is not None and "env_args" in data.attrs,
+            )
     except (OSError, RuntimeError, ValueError, KeyError):
         return frozenset()
     if bare:

@@ -34,14 +34,16 @@ def open_pooled(
 ) -> Iterator[Source]:
     """Several files or folders, each as :func:`~ddco_pyro.data.sources.open_source` takes it, as one source.
 
-    The name of a demonstration begins with that of its file, which is its task unless its attributes name another one.
-    Labels are called as their names say; those without names are of their task: ``reach: 2`` is another one than
-    ``push: 2``. Where a file lacks labels that another one has, they are unknown.
+    The name of a demonstration begins with that of its file, which is its task unless its attributes name
+    another one. Labels are called as their names say; those without names are of their task: ``reach: 2`` is
+    another one than ``push: 2``. Where a file lacks labels that another one has, they are unknown.
 
     :raises DemonstrationsError: a file cannot be read, or two files have one name.
     """
     if len({path.stem for path in paths}) < len(paths):
-        twice = next(path for number, path in enumerate(paths) if path.stem in [one.stem for one in paths[:number]])
+        twice = next(
+            path for number, path in enumerate(paths) if path.stem in [one.stem for one in paths[:number]]
+        )
         raise DemonstrationsError(f"{twice}: another file is called {twice.stem}, too; rename one of both")
     with ExitStack() as stack:
         each = {path.stem: stack.enter_context(open_source(path, form, actions)) for path in paths}
@@ -77,7 +79,9 @@ def open_pooled(
             for key in words.keys() & demo.labels.keys():
                 for value, word in words[key].get(name, {}).items():
                     labels[key][demo.labels[key] == value] = called[key].index(word)
-            return Demonstration.stored(name, demo.observations, demo.actions, labels, {**demo.attributes, TASK: task})
+            return Demonstration.stored(
+                name, demo.observations, demo.actions, labels, {**demo.attributes, TASK: task}
+            )
 
         masks: dict[str, tuple[str, ...]] = {}
         for stem, source in each.items():

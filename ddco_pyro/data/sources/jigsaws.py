@@ -1,13 +1,15 @@
-"""JIGSAWS, surgeons' demonstrations on a da Vinci robot (Gao and others 2014): text files in the official layout.
+"""JIGSAWS, surgeons' demonstrations on a da Vinci robot (Gao and others 2014): text files in the official
+layout.
 
-A task's folder has ``kinematics/AllGestures/NAME.txt``, one row of 76 numbers for each frame, 30 frames a second;
-``transcriptions/NAME.txt``, rows ``FIRST LAST GESTURE`` whose frames count from 1, the last one included; and
-``meta_file_TASK.txt``, a row of a name, a self-stated skill and a rating for each trial.
+A task's folder has ``kinematics/AllGestures/NAME.txt``, one row of 76 numbers for each frame, 30 frames a
+second; ``transcriptions/NAME.txt``, rows ``FIRST LAST GESTURE`` whose frames count from 1, the last one
+included; and ``meta_file_TASK.txt``, a row of a name, a self-stated skill and a rating for each trial.
 
-A row has 19 numbers for each of four arms: position [3] in m, rotation matrix [9], velocity [3] in m/s, angular
-velocity [3] in rad/s, and the gripper's angle in rad. The order is master left, master right, and the instruments that
-the files' own documentation calls slave left and slave right. The left master drives the *last* instrument: each
-displacement of that one is half of the master's. Arms are named by the surgeon's hand here.
+A row has 19 numbers for each of four arms: position [3] in m, rotation matrix [9], velocity [3] in m/s,
+angular velocity [3] in rad/s, and the gripper's angle in rad. The order is master left, master right, and the
+instruments that the files' own documentation calls slave left and slave right. The left master drives the
+*last* instrument: each displacement of that one is half of the master's. Arms are named by the surgeon's hand
+here.
 """
 
 from __future__ import annotations
@@ -39,15 +41,18 @@ TRIAL = re.compile(r".*_(?P<surgeon>[A-Z])(?P<trial>\d{3})")
 def open_jigsaws(path: Path) -> Iterator[Source]:
     """The trials of one task.
 
-    The control [14] is the motion of the surgeon's hands, which the robot repeats: for the left and the right hand
-    velocity [3], angular velocity [3] and gripper angle of the master. Observations are position [3], rotation [9] and
-    gripper angle [1] of each instrument. The instruments' velocities are left out: they are the control itself.
-    ``labels/gesture`` is the place of a frame's gesture among those of the task, -1 for a frame without one.
-    Attributes are the surgeon's letter, the trial's number, the self-stated skill and the rating.
+    The control [14] is the motion of the surgeon's hands, which the robot repeats: for the left and the right
+    hand velocity [3], angular velocity [3] and gripper angle of the master. Observations are position [3],
+    rotation [9] and gripper angle [1] of each instrument. The instruments' velocities are left out: they are
+    the control itself. ``labels/gesture`` is the place of a frame's gesture among those of the task, -1 for a
+    frame without one. Attributes are the surgeon's letter, the trial's number, the self-stated skill and the
+    rating.
 
     :raises DemonstrationsError: a transcription cannot be read; at reading a trial, its file cannot.
     """
-    trials = {f"demo_{n}": trial for n, trial in enumerate(sorted((path / "kinematics/AllGestures").glob("*.txt")))}
+    trials = {
+        f"demo_{n}": trial for n, trial in enumerate(sorted((path / "kinematics/AllGestures").glob("*.txt")))
+    }
     transcriptions = [path / "transcriptions" / trial.name for trial in trials.values()]
     described = sorted(path.glob("meta_file_*.txt"))
     segments = {place.name: _segments(place) for place in transcriptions if place.is_file()}
@@ -60,7 +65,9 @@ def open_jigsaws(path: Path) -> Iterator[Source]:
         trial = trials[name]
         arms = _arms(trial, name)
         observations = {
-            f"{hand}_{key}": arms[:, place, part] for hand, (_, place) in HANDS.items() for key, part in PARTS.items()
+            f"{hand}_{key}": arms[:, place, part]
+            for hand, (_, place) in HANDS.items()
+            for key, part in PARTS.items()
         }
         control = np.concatenate([arms[:, place, 12:] for place, _ in HANDS.values()], axis=1)
         gesture = np.full(len(arms), -1)
@@ -71,7 +78,9 @@ def open_jigsaws(path: Path) -> Iterator[Source]:
             facts |= {"surgeon": named["surgeon"], "trial": int(named["trial"])}
         if said := about.get(trial.stem):
             facts |= {"skill": said[0], "rating": float(said[1])}
-        return Demonstration.stored(name, observations, control, {"gesture": gesture} if gestures else {}, facts)
+        return Demonstration.stored(
+            name, observations, control, {"gesture": gesture} if gestures else {}, facts
+        )
 
     yield Source(tuple(trials), read, {}, 30.0, {LABEL_NAMES: json.dumps({"gesture": gestures})})
 
@@ -79,7 +88,11 @@ def open_jigsaws(path: Path) -> Iterator[Source]:
 def _arms(trial: Path, name: str) -> np.ndarray:
     """The numbers of each arm in each frame, [T, 4, 19]."""
     try:
-        rows = np.loadtxt(trial.read_text().splitlines(), ndmin=2) if trial.stat().st_size else np.empty((0, WIDTH))
+        rows = (
+            np.loadtxt(trial.read_text().splitlines(), ndmin=2)
+            if trial.stat().st_size
+            else np.empty((0, WIDTH))
+        )
     except ValueError as error:
         raise DemonstrationsError(f"{name}: {trial} is no table of numbers: {error}") from None
     if rows.shape[1] != WIDTH or not len(rows):

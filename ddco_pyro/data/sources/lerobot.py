@@ -57,12 +57,12 @@ _NO_CONTROL = {"timestamp", "frame_index", "episode_index", "index", "task_index
 class LeRobot:
     """A dataset's folder: ``meta/info.json``, ``meta/episodes``, ``data`` and ``videos``.
 
-    ``observation.images.top`` becomes ``obs/images/top``, ``action`` becomes ``actions``, and ``subtask_index`` becomes
-    ``labels/subtask``. Beside ``observation.state``, the feature ``observation.state.gripper`` keeps its dots.
-    Where tasks change within an episode, ``task_index`` becomes ``labels/task``. Names are those of
-    ``meta/subtasks.parquet`` and ``meta/tasks.parquet``.
-    Without the column of subtasks, the subtasks in ``meta/lerobot_annotations.json`` become labels: they are numbered
-    in the order in which they first occur, and -1 marks steps before the first one.
+    ``observation.images.top`` becomes ``obs/images/top``, ``action`` becomes ``actions``, and
+    ``subtask_index`` becomes ``labels/subtask``. Beside ``observation.state``, the feature
+    ``observation.state.gripper`` keeps its dots. Where tasks change within an episode, ``task_index`` becomes
+    ``labels/task``. Names are those of ``meta/subtasks.parquet`` and ``meta/tasks.parquet``. Without the
+    column of subtasks, the subtasks in ``meta/lerobot_annotations.json`` become labels: they are numbered in
+    the order in which they first occur, and -1 marks steps before the first one.
 
     :param actions: features that are the control together, in this order; ``action`` if empty.
     :raises DemonstrationsError: the dataset has another version, or is damaged.
@@ -115,7 +115,10 @@ class LeRobot:
         return Source(names, self._read, masks, self._frequency, about)
 
     def _check_actions(self) -> None:
-        types = {name: about.get("dtype") if isinstance(about, dict) else None for name, about in self.features.items()}
+        types = {
+            name: about.get("dtype") if isinstance(about, dict) else None
+            for name, about in self.features.items()
+        }
         there = [name for name, dtype in types.items() if not {name, str(dtype)} & _NO_CONTROL]
         for feature in self._actions:
             if feature not in there:
@@ -154,7 +157,9 @@ class LeRobot:
         with reading(path):
             columns = parquet.read_table(path).to_pydict()
             numbers = columns.pop(f"{kind}_index")
-            texts = next((texts for texts in columns.values() if all(isinstance(text, str) for text in texts)), ())
+            texts = next(
+                (texts for texts in columns.values() if all(isinstance(text, str) for text in texts)), ()
+            )
             names = {int(number): text for number, text in zip(numbers, texts, strict=True) if number >= 0}
             if max(names, default=0) >= MOST_NAMES:
                 raise ValueError(f"{kind}_index is {max(names)}")
@@ -163,7 +168,9 @@ class LeRobot:
     def _path(self, template: str, index: int, prefix: str, **more: str) -> Path:
         """A file of an episode, in the dataset's folder, by a template of ``meta/info.json``."""
         with reading(self.folder, f"demo_{index}: {template}"):
-            numbers = {name: int(self._episodes[index][f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")}
+            numbers = {
+                name: int(self._episodes[index][f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")
+            }
             path = filled(self.folder, str(self.info[template]), {**numbers, "episode_index": index, **more})
         return inside(self.folder, path)
 
@@ -176,21 +183,27 @@ class LeRobot:
         with reading(self.folder, name):
             rows = _Rows(path, index, name)
             self._check(rows, index)
-            observations = {key: self._observation(rows, feature, index) for feature, key in self.keys.items()}
+            observations = {
+                key: self._observation(rows, feature, index) for feature, key in self.keys.items()
+            }
             there = {name: column for name, column in self._labels.items() if column in rows.schema.names}
             labels = {name: np.asarray(rows.numbers(column, ())) for name, column in there.items()}
             if self._annotated:
                 labels["subtask"] = np.full(len(rows), -1)
                 for start, number in self._annotated.get(index, ()):
                     labels["subtask"][max(start, 0) :] = number
-            controls = {key: np.asarray(rows.numbers(key, self.features[key]["shape"])) for key in self._actions}
+            controls = {
+                key: np.asarray(rows.numbers(key, self.features[key]["shape"])) for key in self._actions
+            }
         tasks = self._episodes[index].get("tasks")
         about: dict[str, Attribute] = {"episode_index": index}
         if isinstance(tasks, Sequence) and len(tasks):
             about["task"] = "; ".join(map(str, tasks))
         noted = self._noted.get(index, {})
         about |= {key: noted[key] for key in ("flag", "note") if isinstance(noted.get(key), bool | str)}
-        return Demonstration.stored(name, observations, joined(controls, f"{self.folder}: {name}"), labels, about)
+        return Demonstration.stored(
+            name, observations, joined(controls, f"{self.folder}: {name}"), labels, about
+        )
 
     def _check(self, rows: _Rows, index: int) -> None:
         """Refuse an episode with a wrong number of rows, or with rows out of order."""
@@ -206,10 +219,10 @@ class LeRobot:
                 wrong = ~(np.abs(times - expected) < 0.5 / frequency)
                 if wrong.any():
                     at = int(wrong.argmax())
-                    usual = (
-                        f"is {times[at]:.6g} in row {at}, not {expected[at]:.6g}; correct it, or fps in meta/info.json"
+                    usual = f"is {times[at]:.6g} in row {at}, not {expected[at]:.6g}; correct it, or fps in meta/info.json"
+                    raise DemonstrationsError(
+                        f"{rows.path}: {rows.name}: {column} {clock_fault(times) or usual}"
                     )
-                    raise DemonstrationsError(f"{rows.path}: {rows.name}: {column} {clock_fault(times) or usual}")
 
     def _observation(self, rows: _Rows, key: str, index: int) -> Observed:
         about = self.features[key]
@@ -230,7 +243,9 @@ class LeRobot:
             path = self._path("video_path", index, f"videos/{key}", video_key=key)
             begin = float(self._episodes[index][f"videos/{key}/from_timestamp"])
         rate = self._frequency or 1.0
-        yield from in_blocks(frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size), size)
+        yield from in_blocks(
+            frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size), size
+        )
 
 
 class _Rows:
@@ -249,7 +264,9 @@ class _Rows:
     def column(self, key: str) -> Any:
         """A column of the episode, in one piece."""
         if key not in self.schema.names:
-            raise DemonstrationsError(f"{self.path}: {self.name}: has no column {key}, which meta/info.json names")
+            raise DemonstrationsError(
+                f"{self.path}: {self.name}: has no column {key}, which meta/info.json names"
+            )
         return parquet.read_table(self.path, columns=[key], filters=self.only).column(key).combine_chunks()
 
     def numbers(self, key: str, shape: Sequence[int]) -> LazyArray:
@@ -270,7 +287,9 @@ class _Rows:
             while pyarrow.types.is_nested(values.type):
                 row = np.repeat(row, compute.list_value_length(values).fill_null(0).to_numpy())
                 values = values.flatten()
-            counts = np.bincount(row[values.is_valid().to_numpy(zero_copy_only=False)], minlength=stop - start)
+            counts = np.bincount(
+                row[values.is_valid().to_numpy(zero_copy_only=False)], minlength=stop - start
+            )
             if (counts != size).any():
                 at = int((counts != size).argmax())
                 has = f"{key} has {counts[at]} numbers in row {start + at}, and meta/info.json says {size}"
@@ -281,7 +300,9 @@ class _Rows:
         """Encoded pictures of consecutive steps, uint8 [steps, H, W, 3], in blocks."""
 
         def decoded(encoded: bytes | None) -> np.ndarray:
-            image = None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+            image = (
+                None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+            )
             if image is None or image.shape[:2] != size:
                 wrong = f"an image is damaged, not in the parquet file itself, or not {size[0]} x {size[1]}"
                 raise DemonstrationsError(f"{self.path}: {self.name}: {wrong}")
@@ -298,7 +319,9 @@ def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         with reading(path):
             names = parquet.read_schema(path).names
-            rows = parquet.read_table(path, columns=[key for key in names if not key.startswith("stats/")]).to_pylist()
+            rows = parquet.read_table(
+                path, columns=[key for key in names if not key.startswith("stats/")]
+            ).to_pylist()
             for row in rows:
                 index = int(row["episode_index"])
                 if index in episodes:

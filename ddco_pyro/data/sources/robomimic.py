@@ -1,8 +1,8 @@
 """HDF5 files of robomimic's layout, which is also this project's: read and written.
 
-A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and optional ``labels/<name>`` [T].
-Optional datasets ``mask/<name>`` list names of demonstrations (robomimic: filter keys). Signals of subtasks, such as
-MimicGen's and Isaac Lab's, are read as ``labels/subtask``.
+A file holds groups ``data/<name>`` with ``actions`` [T, A], ``obs/<key>`` [T, ...] and optional
+``labels/<name>`` [T]. Optional datasets ``mask/<name>`` list names of demonstrations (robomimic: filter
+keys). Signals of subtasks, such as MimicGen's and Isaac Lab's, are read as ``labels/subtask``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,17 @@ from ddco_pyro.data.arrays import blocks, is_picture
 from ddco_pyro.data.demonstration import Attribute, Demonstration
 from ddco_pyro.data.errors import DemonstrationsError
 from ddco_pyro.data.files import whole_file
-from ddco_pyro.data.hdf5 import attributes_of, dataset_at, datasets, lazy, member, natural, opened, values_of, written
+from ddco_pyro.data.hdf5 import (
+    attributes_of,
+    dataset_at,
+    datasets,
+    lazy,
+    member,
+    natural,
+    opened,
+    values_of,
+    written,
+)
 from ddco_pyro.data.labels import LABEL_NAMES, label_names
 from ddco_pyro.data.sources import Source
 from ddco_pyro.data.sources.metadata import rate
@@ -36,11 +46,12 @@ SUBTASK = "subtask"
 SIGNALS = ("datagen_info/subtask_term_signals", "obs/datagen_info/subtask_term_signals")
 """Where MimicGen and Isaac Lab have a signal for each subtask: 1 from its last step on. What follows has none."""
 
-# --- reading ----------------------------------------------------------------------------------------------------------
+# --- reading ------------------------------------------------------------------------------------------------
 
 
 def open_robomimic(path: Path) -> Iterator[Source]:
-    """Open a file. Its source's ``read`` also takes the keys of observations and the names of labels; all if None.
+    """Open a file. Its source's ``read`` also takes the keys of observations and the names of labels; all if
+    None.
 
     :raises DemonstrationsError: the file cannot be read.
     """
@@ -68,7 +79,8 @@ def open_robomimic(path: Path) -> Iterator[Source]:
 
 
 def _ends(group: h5py.Group, name: str) -> dict[str, int]:
-    """The last step of each subtask by name, the first one first; of one that never ends, the number of steps.
+    """The last step of each subtask by name, the first one first; of one that never ends, the number of
+    steps.
 
     Empty without signals, and where the demonstration has labels of this name.
     """
@@ -76,7 +88,9 @@ def _ends(group: h5py.Group, name: str) -> dict[str, int]:
     if place is None or f"labels/{SUBTASK}" in group:
         return {}
     members, where = member(group, place, h5py.Group, f"{name}: "), f"{name}: {place}/"
-    signals = {key: values_of(dataset_at(members, key, where), where + key) for key in datasets(members, where)}
+    signals = {
+        key: values_of(dataset_at(members, key, where), where + key) for key in datasets(members, where)
+    }
     ends = {key: int(np.append(values.ravel() > 0, True).argmax()) for key, values in signals.items()}
     return dict(sorted(ends.items(), key=lambda item: item[1]))
 
@@ -120,8 +134,12 @@ def _read(
         labels = ()
     labels = labels and [key for key in labels if key not in signalled]
     seen = {key: lazy(dataset, f"{name}: obs/{key}") for key, dataset in found("obs", observations).items()}
-    known = {key: values_of(dataset, f"{name}: labels/{key}") for key, dataset in found("labels", labels).items()}
-    return Demonstration.stored(name, seen, values_of(control, f"{name}: actions"), known | signalled, attributes)
+    known = {
+        key: values_of(dataset, f"{name}: labels/{key}") for key, dataset in found("labels", labels).items()
+    }
+    return Demonstration.stored(
+        name, seen, values_of(control, f"{name}: actions"), known | signalled, attributes
+    )
 
 
 def _mask(masks: h5py.Group, mask: str) -> tuple[str, ...]:
@@ -147,14 +165,15 @@ def frequency_of(attributes: Mapping[str, Attribute]) -> float | None:
         return rate(attributes)
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
+# --- writing ------------------------------------------------------------------------------------------------
 
 
 @contextmanager
 def robomimic_file(
     path: Path, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]]
 ) -> Iterator[h5py.Group]:
-    """The group ``data`` of a new file, for :func:`write_demonstration`; the file is written whole or not at all.
+    """The group ``data`` of a new file, for :func:`write_demonstration`; the file is written whole or not at
+    all.
 
     ``attributes`` and ``masks`` are read at the end of the block.
     """
@@ -165,7 +184,9 @@ def robomimic_file(
             (data if name == ENVIRONMENT else file).attrs[name] = value
         data.attrs[ALL_STEPS] = sum(len(group["actions"]) for group in data.values())
         for name, members in masks.items():
-            file.create_dataset(f"mask/{name}", data=np.array([member.encode() for member in members], dtype=np.bytes_))
+            file.create_dataset(
+                f"mask/{name}", data=np.array([member.encode() for member in members], dtype=np.bytes_)
+            )
 
 
 def write_demonstration(data: h5py.Group, demo: Demonstration) -> None:
@@ -174,7 +195,9 @@ def write_demonstration(data: h5py.Group, demo: Demonstration) -> None:
     group.attrs.update({**demo.attributes, STEPS: len(demo)})
     for place, array in demo.arrays().items():
         packed = is_picture(array) and 0 not in array.shape
-        how = {"chunks": (1, *array.shape[1:]), "compression": "gzip", "compression_opts": 1} if packed else {}
+        how = (
+            {"chunks": (1, *array.shape[1:]), "compression": "gzip", "compression_opts": 1} if packed else {}
+        )
         dataset, at = group.create_dataset(place, array.shape, array.dtype, **how), 0
         for block in blocks(array):
             dataset[at : at + len(block)] = block

@@ -33,7 +33,8 @@ def frames(path: Path, start: float = 0.0) -> Iterator[tuple[float, np.ndarray]]
 def frames_of_steps(
     path: Path, name: str, start: float, steps: int, frequency: float, size: tuple[int, int]
 ) -> Iterator[np.ndarray]:
-    """The frames of a demonstration's consecutive steps, each within half a step of its time, uint8 [H, W, 3].
+    """The frames of a demonstration's consecutive steps, each within half a step of its time, uint8 [H, W,
+    3].
 
     :param name: of the demonstration, for messages.
     :param start: the time of the first one, in seconds.
@@ -41,7 +42,9 @@ def frames_of_steps(
     :raises DemonstrationsError: a frame is missing, or of another size, or the video cannot be decoded.
     """
     if not path.is_file():
-        raise DemonstrationsError(f"{name}: {path}: the video is missing; leave its observation out with --observation")
+        raise DemonstrationsError(
+            f"{name}: {path}: the video is missing; leave its observation out with --observation"
+        )
     seen = 0
     try:
         for time, frame in islice(frames(path, max(start - 0.5 / frequency, 0)), steps):
@@ -55,6 +58,10 @@ def frames_of_steps(
             seen += 1
             yield frame
     except (av.FFmpegError, IndexError) as error:
-        raise DemonstrationsError(f"{name}: {path}: cannot be decoded: {' '.join(str(error).split())[:200]}") from error
+        raise DemonstrationsError(
+            f"{name}: {path}: cannot be decoded: {' '.join(str(error).split())[:200]}"
+        ) from error
     if seen != steps:
-        raise DemonstrationsError(f"{name}: {path}: has {seen} frames from second {start:g} on, and {steps} are needed")
+        raise DemonstrationsError(
+            f"{name}: {path}: has {seen} frames from second {start:g} on, and {steps} are needed"
+        )

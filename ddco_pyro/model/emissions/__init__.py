@@ -21,7 +21,9 @@ from ddco_pyro.model.emissions.product import Product
 from ddco_pyro.spec import Kind
 
 KINDS: dict[str, type[Emission]] = {
-    kind: getattr(import_module(f"{__name__}.{kind}"), kind.capitalize()) for kind in get_args(Kind) if kind != "auto"
+    kind: getattr(import_module(f"{__name__}.{kind}"), kind.capitalize())
+    for kind in get_args(Kind)
+    if kind != "auto"
 }
 """The class of each kind of control part."""
 

@@ -1,7 +1,7 @@
 """Emissions: how the numbers that networks give a caller become a distribution of the control (paper §4.2).
 
-The callers of a level share one emission object. Each kind of distribution is a class in a file of its own; the package
-has them by name. Controls are in scaled units; log-densities are in the control's own units.
+The callers of a level share one emission object. Each kind of distribution is a class in a file of its own;
+the package has them by name. Controls are in scaled units; log-densities are in the control's own units.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class Information:
     """The information that the posterior expects of some numbers of a network, for an M-step.
 
     :param columns: the numbers.
-    :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times 1/σ².
+    :param weight: h of each output [N, T, K, n]. Or a weight of all outputs, [N, T, K]: h is the weight times
+        1/σ².
     :param std: the places of σ of these means among the parameters of the control.
     :param count: how many controls the weight stands for, [N, T, K]; None where it is their number.
     """
@@ -51,7 +52,8 @@ class Information:
 
     @classmethod
     def of_logits(cls, columns: slice, weight: Tensor, p: Tensor) -> Self:
-        """At least that of logits of a choice with these probabilities, [N, T, K, n], made with a weight [N, T, K].
+        """At least that of logits of a choice with these probabilities, [N, T, K, n], made with a weight [N,
+        T, K].
 
         diag(p) - pp^T is the Laplacian of a graph, and so at most twice its own diagonal.
         """
@@ -78,12 +80,12 @@ class Given(NamedTuple):
 class Emission(ABC):
     """The distributions of the controls of K callers, [..., K, A].
 
-    A kind is a dataclass of tensors [..., K, ...], of tensors that are the same at all steps, and of other emissions.
-    The first field is a tensor [..., K, ...].
+    A kind is a dataclass of tensors [..., K, ...], of tensors that are the same at all steps, and of other
+    emissions. The first field is a tensor [..., K, ...].
 
     :cvar further_noise: normal numbers that a draw takes beside one for each dimension.
-    :cvar control: the control of one caller, [A] in its own units, by numpy alone: of a part, the caller's numbers, its
-        parameters, and standard normal numbers, None for the mode. An export has its source.
+    :cvar control: the control of one caller, [A] in its own units, by numpy alone: of a part, the caller's
+        numbers, its parameters, and standard normal numbers, None for the mode. An export has its source.
     :cvar helpers: the functions that :attr:`control` calls.
     """
 
@@ -150,7 +152,8 @@ class Emission(ABC):
 
     @abstractmethod
     def information(self, acting: Tensor, actions: Tensor) -> Iterator[Information]:
-        """What the posterior expects to learn of numbers and parameters from controls [N, T, A], for an M-step.
+        """What the posterior expects to learn of numbers and parameters from controls [N, T, A], for an
+        M-step.
 
         :param acting: the posterior probability that a caller acts, float64 [N, T, K].
         """
@@ -164,7 +167,10 @@ class Emission(ABC):
             for name, value in each.items()
             if isinstance(value, Emission) or value.dim() == dimensions
         }
-        return [replace(self, **dict(zip(by_step, now, strict=True))) for now in zip(*by_step.values(), strict=True)]  # type: ignore[type-var]
+        return [
+            replace(self, **dict(zip(by_step, now, strict=True)))
+            for now in zip(*by_step.values(), strict=True)
+        ]  # type: ignore[type-var]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The emission of changed tensors."""

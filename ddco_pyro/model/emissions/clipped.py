@@ -16,11 +16,12 @@ from ddco_pyro.model.emissions.gaussian import Gaussian
 
 @dataclass(frozen=True)
 class Clipped(Gaussian):
-    """A continuous control that reaches its bounds: a = min(max(z, low), high) of z ~ N(μ, σ²), a censored normal.
+    """A continuous control that reaches its bounds: a = min(max(z, low), high) of z ~ N(μ, σ²), a censored
+    normal.
 
-    Within its bounds a control has the normal's density. On a bound, or beyond, it has the probability Φ of what lies
-    there. That is a mass, whatever the units: densities and masses are different measures. Divergences are those of
-    the normals before clipping, upper bounds of those after.
+    Within its bounds a control has the normal's density. On a bound, or beyond, it has the probability Φ of
+    what lies there. That is a mass, whatever the units: densities and masses are different measures.
+    Divergences are those of the normals before clipping, upper bounds of those after.
 
     :param low: the lower bound of each dimension in scaled units, -inf for none, [A]; ``high`` likewise.
     """
@@ -46,7 +47,9 @@ class Clipped(Gaussian):
         step, dim = side.nonzero(as_tuple=True)  # log Φ is computed on bounds alone, for each caller
         places = (step * (callers * size) + dim + size * torch.arange(callers).unsqueeze(1)).flatten()
         errors = self._errors(actions.clamp(self.low, self.high))
-        mass = LogNormal.apply((errors.flatten().index_select(0, places).view(callers, -1) * side[step, dim]).flatten())
+        mass = LogNormal.apply(
+            (errors.flatten().index_select(0, places).view(callers, -1) * side[step, dim]).flatten()
+        )
         each = self._scored(errors)
         return each.flatten().index_copy(0, places, mass).reshape(each.shape)
 
@@ -65,7 +68,8 @@ TAIL = {torch.float32: -12.0, torch.float64: -30.0}
 class LogNormal(torch.autograd.Function):
     """log Φ(x), [M], with the gradient φ(x) / Φ(x), which is finite however small x is; differentiable once.
 
-    torch's own takes ten times as long, gives NaN in float32, and loses its gradient to rounding from -1e8 on.
+    torch's own takes ten times as long, gives NaN in float32, and loses its gradient to rounding from -1e8
+    on.
     """
 
     @staticmethod

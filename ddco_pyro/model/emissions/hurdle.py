@@ -31,10 +31,11 @@ def hurdle_control(part: Part, numbers: np.ndarray, std: np.ndarray, z: np.ndarr
 
 @dataclass(frozen=True)
 class Hurdle(Emission):
-    """A two-part control: exactly one value with probability p = logistic(y), continuous otherwise (a hurdle model).
+    """A two-part control: exactly one value with probability p = logistic(y), continuous otherwise (a hurdle
+    model).
 
-    All dimensions are at their values at once, or none is. The value is 0 in scaled units, and no other control is, so
-    the comparison is exact at any scale.
+    All dimensions are at their values at once, or none is. The value is 0 in scaled units, and no other
+    control is, so the comparison is exact at any scale.
 
     :param logit: y, [..., K, 1].
     :param slab: the continuous part.

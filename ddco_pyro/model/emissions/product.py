@@ -68,9 +68,13 @@ class Product(Emission):
         return [replace(self, groups=tuple(zip(names, emissions, strict=True))) for emissions in each]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        return replace(self, groups=tuple((dimensions, emission.map(change)) for dimensions, emission in self.groups))
+        return replace(
+            self, groups=tuple((dimensions, emission.map(change)) for dimensions, emission in self.groups)
+        )
 
     def _joined(self, values: Sequence[Tensor]) -> Tensor:
         """The groups' values [..., K, A_g] in the order of the dimensions."""
-        order = torch.tensor([dimension for dimensions, _ in self.groups for dimension in dimensions]).argsort()
+        order = torch.tensor(
+            [dimension for dimensions, _ in self.groups for dimension in dimensions]
+        ).argsort()
         return torch.cat(list(values), dim=-1)[..., order]

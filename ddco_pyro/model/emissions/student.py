@@ -2,8 +2,9 @@
 
     a = μ + σ z / √τ,    z ~ N(0, 1) in each dimension,    τ ~ Gamma(ν/2, ν/2) once in each step,    ν = 4.
 
-So a ~ t_ν(μ, σ²), the multivariate Student t (Lange, Little and Taylor 1989). A step with large errors has a small
-expected precision E[τ | a] = (ν + A) / (ν + Σ_d r_d²) of its residuals r = (a - μ) / σ, and counts so much less.
+So a ~ t_ν(μ, σ²), the multivariate Student t (Lange, Little and Taylor 1989). A step with large errors has a
+small expected precision E[τ | a] = (ν + A) / (ν + Σ_d r_d²) of its residuals r = (a - μ) / σ, and counts so
+much less.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ def student_control(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray
 class Student(Gaussian):
     """A multivariate Student t with a diagonal scale.
 
-    Divergences are those of controls together with their latent scales, which are those of the normals, as E[τ] = 1:
-    upper bounds of those of the controls alone.
+    Divergences are those of controls together with their latent scales, which are those of the normals, as
+    E[τ] = 1: upper bounds of those of the controls alone.
     """
 
     further_noise: ClassVar[int] = NU
@@ -73,4 +74,6 @@ class Student(Gaussian):
     def draw(self, noise: Tensor) -> Tensor:
         """μ + σ z / √τ, where τ is the mean square of the last ν numbers, a χ² variate divided by ν."""
         z, squares = noise[..., :-NU], noise[..., -NU:].double().square()
-        return self.mean + self.std * (z * squares.mean(-1, keepdim=True).rsqrt()).unsqueeze(-2).to(self.mean.dtype)
+        return self.mean + self.std * (z * squares.mean(-1, keepdim=True).rsqrt()).unsqueeze(-2).to(
+            self.mean.dtype
+        )

@@ -24,8 +24,8 @@ CLASSES: dict[str, type[Network]] = {
     "lstm": Lstm,
     "branches": Branches,
 }
-"""The built-in networks by name, each made as ``Class(shape, copies, **settings)``. The settings, as a spec has them,
-are those of :mod:`ddco_pyro.spec.networks`."""
+"""The built-in networks by name, each made as ``Class(shape, copies, **settings)``. The settings, as a spec
+has them, are those of :mod:`ddco_pyro.spec.networks`."""
 
 
 def build(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: int) -> Network:
@@ -34,8 +34,8 @@ def build(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: int
     A network with ``inputs`` is given no other observations.
 
     :param shape: of the observations.
-    :raises ShapeError: the network cannot read these observations, cannot be imported or made, or is refused by
-        :func:`ddco_pyro.model.networks.probe.try_network`.
+    :raises ShapeError: the network cannot read these observations, cannot be imported or made, or is refused
+        by :func:`ddco_pyro.model.networks.probe.try_network`.
     """
     settings, seen = dict(spec.settings), shape.select(spec.inputs) if spec.inputs else shape
     if isinstance(spec, UserNetworkSpec):
@@ -45,7 +45,9 @@ def build(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: int
             with named("over"):
                 settings["over"] = build(settings["over"], seen, None, copies)
         if "of" in settings:
-            settings["of"] = {name: _branch(name, branch, seen, copies) for name, branch in settings["of"].items()}
+            settings["of"] = {
+                name: _branch(name, branch, seen, copies) for name, branch in settings["of"].items()
+            }
         network = CLASSES[spec.network](seen, copies, **settings)
         network = network if outputs is None else network.add_head(outputs)
     if spec.inputs:

@@ -30,11 +30,12 @@ POOLED = 8
 
 
 class Conv(Network):
-    """K networks of convolutions over each picture, pooled, and a perceptron over the pooled maps and the vectors.
+    """K networks of convolutions over each picture, pooled, and a perceptron over the pooled maps and the
+    vectors.
 
     :param layers: the convolutions.
-    :param pool: ``mean`` of :data:`POOLED` × :data:`POOLED` fields of each map, ``flatten`` for the whole map, or the
-        expected place under its softmax, ``spatial_softmax``.
+    :param pool: ``mean`` of :data:`POOLED` × :data:`POOLED` fields of each map, ``flatten`` for the whole
+        map, or the expected place under its softmax, ``spatial_softmax``.
     :param standardize: whether each picture is scaled to mean 0 and standard deviation 1.
     :raises ShapeError: there is no picture, or one is too small for the layers.
     """
@@ -52,7 +53,9 @@ class Conv(Network):
     ) -> None:
         super().__init__()
         if not shape.images:
-            raise ShapeError("needs an image among the observations, and all of them are vectors: use network: mlp")
+            raise ShapeError(
+                "needs an image among the observations, and all of them are vectors: use network: mlp"
+            )
         self.reads, self.copies, self.pool = list(shape.vectors), copies, pool
         self.pictures = list(shape.images)
         self.activation, self.standardize = ACTIVATIONS[activation](), standardize
@@ -60,20 +63,27 @@ class Conv(Network):
         firsts = [_convolution(layers[0], size[-1], copies) for size in shape.images.values()]
         self.convolutions = nn.ModuleList(
             nn.ModuleList(
-                [own, *(_convolution(layer, copies * above.filters, copies, copies) for above, layer in pairs)]
+                [
+                    own,
+                    *(_convolution(layer, copies * above.filters, copies, copies) for above, layer in pairs),
+                ]
             )
             for own in firsts
         )
         if pool == "spatial_softmax":
             with torch.no_grad():
-                for parameter in (each for layers in self._layers().values() for each in layers[-1].parameters()):
+                for parameter in (
+                    each for layers in self._layers().values() for each in layers[-1].parameters()
+                ):
                     parameter.mul_(SHARPNESS)
         maps = sum(self._map_features(key, own, shape.images[key]) for key, own in self._layers().items())
         self.layers = Perceptrons(copies, shape.vector + maps, hidden, dropout, activation)
 
     def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
         vector = inputs.vector.flatten(0, 1).expand(self.copies, -1, -1)
-        maps = [self._maps(layers, inputs.images[key].flatten(0, 1)) for key, layers in self._layers().items()]
+        maps = [
+            self._maps(layers, inputs.images[key].flatten(0, 1)) for key, layers in self._layers().items()
+        ]
         return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch), state
 
     def numpy_form(self) -> NumpyForm:
@@ -87,7 +97,9 @@ class Conv(Network):
 
     def _layers(self) -> dict[str, list[nn.Conv2d]]:
         """The convolutions of each picture."""
-        each = ([layer for layer in own.children() if isinstance(layer, nn.Conv2d)] for own in self.convolutions)
+        each = (
+            [layer for layer in own.children() if isinstance(layer, nn.Conv2d)] for own in self.convolutions
+        )
         return dict(zip(self.pictures, each, strict=True))
 
     def _maps(self, layers: Sequence[nn.Conv2d], image: Tensor) -> Tensor:
@@ -111,7 +123,9 @@ class Conv(Network):
                 for length in (height, width)
             )
             if min(height, width) < 1:
-                raise ShapeError(f"{key} of {size[0]} × {size[1]} is too small for its layers: take some out, or pad")
+                raise ShapeError(
+                    f"{key} of {size[0]} × {size[1]} is too small for its layers: take some out, or pad"
+                )
         each = {"mean": POOLED**2, "flatten": height * width, "spatial_softmax": 2}[self.pool]
         return layers[-1].out_channels // self.copies * each
 

@@ -23,7 +23,8 @@ class Frames:
     :param arrays: the pictures [T_n, ...] of each trajectory, in memory or in their file.
     :param transform: how they are cropped and scaled.
     :param steps: the T steps of time.
-    :param shifts: rows and columns by which the pictures of each trajectory are shifted, [N, 2]; None for none.
+    :param shifts: rows and columns by which the pictures of each trajectory are shifted, [N, 2]; None for
+        none.
     """
 
     arrays: tuple[Observed, ...]
@@ -89,7 +90,9 @@ class InputShape:
         for name in names:
             if name not in known:
                 there = ", ".join(known)
-                raise ShapeError(f"inputs: there is no observation {name!r}{nearest(name, known)}; there is: {there}")
+                raise ShapeError(
+                    f"inputs: there is no observation {name!r}{nearest(name, known)}; there is: {there}"
+                )
         return InputShape(_of(self.vectors, names), _of(self.images, names), self.steps)
 
 
@@ -133,7 +136,8 @@ class Inputs:
     def part(self, rows: Tensor | slice, steps: slice) -> Inputs:
         """Consecutive steps of some trajectories; nothing is read."""
         vectors, images = (
-            {key: array[rows, steps] for key, array in arrays.items()} for arrays in (self.vectors, self.images)
+            {key: array[rows, steps] for key, array in arrays.items()}
+            for arrays in (self.vectors, self.images)
         )
         return Inputs(vectors, images, self.time[steps])
 

@@ -28,11 +28,17 @@ class Lstm(Network):
 
     The state holds that of ``over``, then h and c [N, K, size] of each layer.
 
-    :param horizon: steps of a window; h and c are zeros again before the first step of each. None for no windows.
+    :param horizon: steps of a window; h and c are zeros again before the first step of each. None for no
+        windows.
     """
 
     def __init__(
-        self, shape: InputShape, copies: int, over: Network | None, hidden: tuple[int, ...], horizon: int | None
+        self,
+        shape: InputShape,
+        copies: int,
+        over: Network | None,
+        hidden: tuple[int, ...],
+        horizon: int | None,
     ) -> None:
         super().__init__()
         self.copies, self.horizon = copies, horizon
@@ -80,7 +86,9 @@ class StackedLstm(nn.Module):
         for parameter in self.parameters():
             nn.init.uniform_(parameter, -1 / math.sqrt(size), 1 / math.sqrt(size))
 
-    def forward(self, values: Tensor, batch: tuple[int, int], h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, values: Tensor, batch: tuple[int, int], h: Tensor, c: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """[K, N · T, inputs] to [K, N · T, size], and h and c [N, K, size] after the last step."""
         if batch[1] == 1:
             return self._step(values, h.transpose(0, 1), c.transpose(0, 1))
@@ -96,8 +104,8 @@ class StackedLstm(nn.Module):
     def _step(self, values: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A single step of all K at once, which can be exported.
 
-        For many steps torch's own loop, copy by copy, takes a half to a fifth of the time (5 copies of size 64 over
-        16 × 100 and 1 × 1000 steps).
+        For many steps torch's own loop, copy by copy, takes a half to a fifth of the time (5 copies of size
+        64 over 16 × 100 and 1 × 1000 steps).
         """
         gates = torch.baddbmm(self.inputs(values), h, self.recurrent)
         take, keep, new, give = gates.chunk(4, -1)
@@ -112,7 +120,12 @@ class StackedLstm(nn.Module):
 
     def _weights(self) -> Iterator[list[Tensor]]:
         for weight, bias, recurrent in zip(self.inputs.weight, self.inputs.bias, self.recurrent, strict=True):
-            yield [weight.mT.contiguous(), recurrent.mT.contiguous(), bias[0], torch.zeros_like(bias[0])]  # for GPUs
+            yield [
+                weight.mT.contiguous(),
+                recurrent.mT.contiguous(),
+                bias[0],
+                torch.zeros_like(bias[0]),
+            ]  # for GPUs
 
 
 def _in_windows(

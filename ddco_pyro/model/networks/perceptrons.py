@@ -16,8 +16,8 @@ from ddco_pyro.spec import Activation
 NumpyForm = dict[str, Any]
 """What the numpy runner of exports has to know: a tree of facts and arrays.
 
-Each node has a ``kind``, a method of :class:`ddco_pyro.exporting.runner.NumpyNetworks`, and reads what its ``of``
-gives."""
+Each node has a ``kind``, a method of :class:`ddco_pyro.exporting.runner.NumpyNetworks`, and reads what its
+``of`` gives."""
 
 
 def vectors(keys: Sequence[str], copies: int) -> NumpyForm:
@@ -68,13 +68,19 @@ class StackedLinear(nn.Module):
 
 
 class Perceptrons(nn.Sequential):
-    """K multi-layer perceptrons, with activation and dropout after every hidden layer; they give ``features`` numbers.
+    """K multi-layer perceptrons, with activation and dropout after every hidden layer; they give ``features``
+    numbers.
 
     Without hidden layers they give their inputs.
     """
 
     def __init__(
-        self, copies: int, inputs: int, hidden: tuple[int, ...], dropout: float = 0.0, activation: Activation = "relu"
+        self,
+        copies: int,
+        inputs: int,
+        hidden: tuple[int, ...],
+        dropout: float = 0.0,
+        activation: Activation = "relu",
     ) -> None:
         layers: list[nn.Module] = []
         sizes = (inputs, *hidden)
@@ -92,16 +98,22 @@ class Perceptrons(nn.Sequential):
     def numpy_form(self, of: NumpyForm) -> NumpyForm:
         """The numpy form of these layers over what ``of`` gives."""
         linear = [arrays_of(layer) for layer in self if isinstance(layer, StackedLinear)]
-        form = {"kind": "perceptrons", "of": of, "layers": linear, "hidden": self.hidden, "activation": self.activation}
+        form = {
+            "kind": "perceptrons",
+            "of": of,
+            "layers": linear,
+            "hidden": self.hidden,
+            "activation": self.activation,
+        }
         return form | {"copies": self.copies, "steps": 1}
 
 
 class Network(nn.Module):
     """K networks side by side, a trunk for others to read; :meth:`add_head` makes it one that gives outputs.
 
-    Every network is called as ``network(inputs, state)``. It maps T steps of N trajectories to [N, T, K, features] and
-    the state after them. A call on T steps gives what T calls on one step each give, with the state carried from each
-    to the next.
+    Every network is called as ``network(inputs, state)``. It maps T steps of N trajectories to [N, T, K,
+    features] and the state after them. A call on T steps gives what T calls on one step each give, with the
+    state carried from each to the next.
 
     :ivar copies: K; 1 where all options read the same features.
     :ivar layers: the last layers, which the head joins.
@@ -186,7 +198,11 @@ def linear_maps(networks: Mapping[str, Network], inputs: Inputs) -> dict[str, Te
     """What the linear networks among these give, [N, T, K, n]: one product for all that read the same vectors."""
     readers: dict[tuple[str, ...], dict[str, StackedLinear]] = {}
     for name, network in networks.items():
-        if isinstance(network, Mlp) and network.is_linear and isinstance(layer := network.layers[0], StackedLinear):
+        if (
+            isinstance(network, Mlp)
+            and network.is_linear
+            and isinstance(layer := network.layers[0], StackedLinear)
+        ):
             readers.setdefault(tuple(network.reads), {})[name] = layer
     given: dict[str, Tensor] = {}
     for reads, layers in readers.items():

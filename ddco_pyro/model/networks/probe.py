@@ -21,8 +21,8 @@ TOLERANCE = 1e-3
 def try_network(name: str, network: Network, shape: InputShape) -> None:
     """Compare a network's outputs for whole trajectories with those for one step after the other.
 
-    Training calls a network in the first way, a controller in the second. Where both agree, no trajectory changes
-    another, and no later step, padding included, changes an earlier one.
+    Training calls a network in the first way, a controller in the second. Where both agree, no trajectory
+    changes another, and no later step, padding included, changes an earlier one.
 
     :raises ShapeError: the network fails, gives another shape than [N, T, K, features], or the two differ.
     """
@@ -86,10 +86,14 @@ def _is_state(state: Any, trajectories: int) -> bool:
     )
 
 
-def _random_inputs(shape: InputShape, trajectories: int, steps: int, dtype: torch.dtype = torch.float32) -> Inputs:
+def _random_inputs(
+    shape: InputShape, trajectories: int, steps: int, dtype: torch.dtype = torch.float32
+) -> Inputs:
     """Vectors between 0 and 1, images, and numbers of steps that a network has parameters for."""
     generator, batch = torch.Generator().manual_seed(0), (trajectories, steps)
-    vectors = {key: torch.rand(*batch, size, generator=generator, dtype=dtype) for key, size in shape.vectors.items()}
+    vectors = {
+        key: torch.rand(*batch, size, generator=generator, dtype=dtype) for key, size in shape.vectors.items()
+    }
     images = {
         key: torch.randint(256, (*batch, *image), generator=generator, dtype=torch.uint8)
         for key, image in shape.images.items()
@@ -124,21 +128,24 @@ def _without_zeros(network: Network) -> Iterator[None]:
 
 
 def training_bytes(networks: Mapping[Network, InputShape]) -> int:
-    """Bytes that these networks, each with what it reads, take for a step while all of them are trained together.
+    """Bytes that these networks, each with what it reads, take for a step while all of them are trained
+    together.
 
-    Each keeps tensors until its gradient is computed. While that happens, what one network computed and its gradient
-    are there too: measured with convolutions, at most twice what the largest network keeps.
+    Each keeps tensors until its gradient is computed. While that happens, what one network computed and its
+    gradient are there too: measured with convolutions, at most twice what the largest network keeps.
     """
     each = networks.items()
-    kept = [_kept(network, shape, *_one_more(network)) - _kept(network, shape, 1, 1) for network, shape in each]
+    kept = [
+        _kept(network, shape, *_one_more(network)) - _kept(network, shape, 1, 1) for network, shape in each
+    ]
     return sum(kept) + 2 * max(kept)
 
 
 def _one_more(network: Network) -> tuple[int, int]:
     """(N, T) one trajectory or step more than (1, 1).
 
-    A step, since a network may have parameters for each; a trajectory where the network remembers, since what torch
-    keeps of several steps grows in leaps.
+    A step, since a network may have parameters for each; a trajectory where the network remembers, since what
+    torch keeps of several steps grows in leaps.
     """
     return (2, 1) if network.initial_state(1) else (1, 2)
 

@@ -19,8 +19,8 @@ FEATURES = 64
 class UserNetwork(Network):
     """A user's module as a :class:`Network`.
 
-    The module maps :class:`Inputs` to [N, T, copies, outputs]. One with ``initial_state(N)`` is called with inputs and
-    a state, and gives outputs and the state after them.
+    The module maps :class:`Inputs` to [N, T, copies, outputs]. One with ``initial_state(N)`` is called with
+    inputs and a state, and gives outputs and the state after them.
     """
 
     def __init__(self, module: nn.Module, outputs: int, copies: int) -> None:
@@ -29,11 +29,14 @@ class UserNetwork(Network):
         self.remembers = hasattr(module, "initial_state")
 
     @classmethod
-    def made(cls, name: str, shape: InputShape, outputs: int | None, copies: int, options: Mapping[str, Any]) -> Self:
+    def made(
+        cls, name: str, shape: InputShape, outputs: int | None, copies: int, options: Mapping[str, Any]
+    ) -> Self:
         """The network of the class ``name``, tried on random observations.
 
         :param outputs: None for a trunk, whose class says their number as ``features``.
-        :raises ShapeError: the class cannot be imported or made, or its network is refused by :func:`try_network`.
+        :raises ShapeError: the class cannot be imported or made, or its network is refused by
+            :func:`try_network`.
         """
         network_class = _imported(name)
         outputs = getattr(network_class, "features", FEATURES) if outputs is None else outputs
@@ -41,7 +44,9 @@ class UserNetwork(Network):
             module = network_class(shape, outputs, copies, **options)
         except Exception as error:  # whatever the user's code raises
             why = " ".join(str(error).split())
-            raise ShapeError(f"network {name!r} cannot be made with options {dict(options)}: {why}") from error
+            raise ShapeError(
+                f"network {name!r} cannot be made with options {dict(options)}: {why}"
+            ) from error
         network = cls(module, outputs, copies)
         try_network(name, network, shape)
         return network

@@ -1,7 +1,8 @@
 """The formats of segments, a row each: a function that writes, in a module of its own.
 
-``write(asked, segmented)`` writes a file or folder, whole or not at all, and returns in words what was written.
-``check(asked)`` of formats that copy demonstrations refuses these or an existing place before anything is segmented.
+``write(asked, segmented)`` writes a file or folder, whole or not at all, and returns in words what was
+written. ``check(asked)`` of formats that copy demonstrations refuses these or an existing place before
+anything is segmented.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class Asked:
     :param source: the demonstrations.
     :param level: the level whose options are subtasks.
     :param annotator: who labelled; empty where no one did.
-    :param same_order: leave out demonstrations whose options follow another order than most, rather than refuse.
+    :param same_order: leave out demonstrations whose options follow another order than most, rather than
+        refuse.
     """
 
     option: str
@@ -58,7 +60,8 @@ class Asked:
         return [name_in_level(option, level, names) for option in range(len(names))]
 
     def runs(self, demo: Segments) -> list[Run]:
-        """The subtasks of a demonstration: its level's options, where the same option chosen anew stays one run.
+        """The subtasks of a demonstration: its level's options, where the same option chosen anew stays one
+        run.
 
         There is none where a person left steps open.
         """
@@ -85,8 +88,8 @@ class Format(NamedTuple):
 
     :param write: its function in this package, ``module:function``.
     :param text: what is written, in words.
-    :param takes: the format of demonstrations that it copies, which ``check`` of its module looks at; empty where it
-        takes any.
+    :param takes: the format of demonstrations that it copies, which ``check`` of its module looks at; empty
+        where it takes any.
     :param extra: of this project, where the format needs a package: a key of :data:`PACKAGES`.
     """
 
@@ -103,14 +106,24 @@ FORMATS = {
     "--html": Format("stream", "tables:write_html", "A page with the timeline of every demonstration."),
     "--csv": Format("stream", "tables:write_csv", "A table with a row for each step."),
     "--parquet": Format("stream", "tables:write_parquet", "The same table as Parquet.", extra="lerobot"),
-    "--out": Format("file", "labels:write", "A copy of the HDF5 file with labels for each step.", "robomimic"),
-    "--lerobot": Format("folder", "lerobot:write_subtasks", "A copy of a LeRobot dataset with subtasks.", "lerobot"),
-    "--sarm": Format("folder", "lerobot:write_stages", "The same with the stages of SARM's reward model.", "lerobot"),
-    "--mimicgen": Format("file", "mimicgen:write", "A copy of a prepared file with MimicGen's signals.", "robomimic"),
+    "--out": Format(
+        "file", "labels:write", "A copy of the HDF5 file with labels for each step.", "robomimic"
+    ),
+    "--lerobot": Format(
+        "folder", "lerobot:write_subtasks", "A copy of a LeRobot dataset with subtasks.", "lerobot"
+    ),
+    "--sarm": Format(
+        "folder", "lerobot:write_stages", "The same with the stages of SARM's reward model.", "lerobot"
+    ),
+    "--mimicgen": Format(
+        "file", "mimicgen:write", "A copy of a prepared file with MimicGen's signals.", "robomimic"
+    ),
     "--isaac": Format("file", "mimicgen:write", "The same for Isaac Lab Mimic.", "robomimic"),
     "--label-studio": Format("folder", "annotations:write_label_studio", "Predictions for Label Studio."),
     "--elan": Format("folder", "annotations:write_elan", "ELAN's .eaf of each demonstration."),
-    "--rerun": Format("folder", "annotations:write_rerun", "Rerun's .rrd of each demonstration.", extra="rerun"),
+    "--rerun": Format(
+        "folder", "annotations:write_rerun", "Rerun's .rrd of each demonstration.", extra="rerun"
+    ),
 }
 """Every format, by its option of ``segment``. A new one is a function, a row here and a parameter there."""
 
@@ -125,7 +138,8 @@ def format_of(option: str) -> Format:
 def check_format(asked: Asked) -> None:
     """Check, before anything is segmented, that a format can be written.
 
-    :raises BadInput: the format copies other demonstrations, its place is taken, or a package that it needs is missing.
+    :raises BadInput: the format copies other demonstrations, its place is taken, or a package that it needs
+        is missing.
     """
     form = format_of(asked.option)
     if form.takes not in ("", asked.source.format):
@@ -145,7 +159,9 @@ def check_copy(form: str, out: Path, path: Path) -> None:
     """
     module = "labels" if form == "robomimic" else "lerobot"
     if out.exists() and not resolve_name(f"{__name__}.{module}:is_copy")(out, path):
-        raise BadInput(f"--out {out}: exists and is not a labelled copy of {path}; choose another --out, or remove it")
+        raise BadInput(
+            f"--out {out}: exists and is not a labelled copy of {path}; choose another --out, or remove it"
+        )
 
 
 def write_format(asked: Asked, segmented: Segmented) -> str:

@@ -24,9 +24,9 @@ STEP = 1000.0
 def write_elan(asked: Asked, segmented: Segmented) -> str:
     """A folder with ``<demonstration>.eaf``; times are milliseconds.
 
-    The highest level comes first. An annotation lasts from the first step of a segment to the first step of the next.
-    Steps that a person left open have none. A tier ``<level>_source`` says who says each segment of a level.
-    A controlled vocabulary has the names of all choices of a level.
+    The highest level comes first. An annotation lasts from the first step of a segment to the first step of
+    the next. Steps that a person left open have none. A tier ``<level>_source`` says who says each segment of
+    a level. A controlled vocabulary has the names of all choices of a level.
     """
     milliseconds = 1000 / segmented.frequency if segmented.frequency else STEP
     when = datetime.now(UTC).isoformat(timespec="seconds")
@@ -58,11 +58,13 @@ def _tiers(asked: Asked, demo: Segments) -> dict[str, list[tuple[str, int, int]]
     }
     if asked.level + SOURCE in demo.sources:
         runs = asked.runs(demo)
-        tiers[asked.level + SOURCE] = [(str(asked.said_by(demo, start, stop)), start, stop) for _, start, stop in runs]
+        tiers[asked.level + SOURCE] = [
+            (str(asked.said_by(demo, start, stop)), start, stop) for _, start, stop in runs
+        ]
     return tiers
 
 
-# --- Label Studio -----------------------------------------------------------------------------------------------------
+# --- Label Studio -------------------------------------------------------------------------------------------
 
 DEMO = "demonstration"
 """In the data of a task, which exports keep."""
@@ -74,10 +76,10 @@ REGIONS = "timeserieslabels"
 def write_label_studio(asked: Asked, segmented: Segmented) -> str:
     """A folder with ``tasks.json`` and ``config.xml``.
 
-    A task shows the controls over time, with the subtasks as predicted ``timeserieslabels``. A subtask's ``score`` is
-    its mean posterior probability; the score of the prediction is the lowest of them, so that Label Studio can begin
-    with the demonstration that is least certain. Times are steps, inclusive. Regions have the name of the level, and
-    who says so as ``meta``. Steps that a person left open have no region.
+    A task shows the controls over time, with the subtasks as predicted ``timeserieslabels``. A subtask's
+    ``score`` is its mean posterior probability; the score of the prediction is the lowest of them, so that
+    Label Studio can begin with the demonstration that is least certain. Times are steps, inclusive. Regions
+    have the name of the level, and who says so as ``meta``. Steps that a person left open have no region.
     """
     tasks = [_task(asked, demo) for demo in segmented.segments]
     with whole_folder(asked.out) as folder:
@@ -110,14 +112,16 @@ def _task(asked: Asked, demo: Segments) -> dict[str, Any]:
     }
 
 
-# --- Rerun ------------------------------------------------------------------------------------------------------------
+# --- Rerun --------------------------------------------------------------------------------------------------
 
 
 def write_rerun(asked: Asked, segmented: Segmented) -> str:
-    """A folder with ``<demonstration>.rrd``, over the timeline ``step``, and ``time`` where the frequency is known.
+    """A folder with ``<demonstration>.rrd``, over the timeline ``step``, and ``time`` where the frequency is
+    known.
 
-    ``segments/<level>`` has a ``StateChange`` at the first step of each segment, a lane of the state timeline. Beside
-    it are the posterior probability of the active option, the controls, and the observations.
+    ``segments/<level>`` has a ``StateChange`` at the first step of each segment, a lane of the state
+    timeline. Beside it are the posterior probability of the active option, the controls, and the
+    observations.
     """
     with whole_folder(asked.out) as folder:
         for demo in segmented.segments:
@@ -135,7 +139,9 @@ def _record(path: str, asked: Asked, demo: Segments, frequency: float | None) ->
     found, steps = asked.source.read(demo.name), np.arange(len(demo))
     stream = rerun.RecordingStream("ddco-pyro", recording_id=demo.name)
     lanes = blueprint.StateTimelineView(origin="segments", name="segments")
-    stream.save(path, default_blueprint=blueprint.Blueprint(blueprint.Vertical(lanes, blueprint.TimeSeriesView())))
+    stream.save(
+        path, default_blueprint=blueprint.Blueprint(blueprint.Vertical(lanes, blueprint.TimeSeriesView()))
+    )
 
     def log(entity: str, at: np.ndarray, columns: Any) -> None:
         times = [rerun.TimeColumn("step", sequence=at)]
@@ -144,7 +150,8 @@ def _record(path: str, asked: Asked, demo: Segments, frequency: float | None) ->
         stream.send_columns(entity, times, columns)
 
     states = {
-        name: (level.options, [*asked.names_of(name), SOURCES[UNKNOWN + 1]]) for name, level in demo.levels.items()
+        name: (level.options, [*asked.names_of(name), SOURCES[UNKNOWN + 1]])
+        for name, level in demo.levels.items()
     }
     states |= {name: (own, [*SOURCES]) for name, own in demo.sources.items()}
     for name, (values, words) in states.items():

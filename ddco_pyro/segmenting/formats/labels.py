@@ -32,7 +32,8 @@ COPIED = "segmented_from"
 
 
 def labels_of(demo: Segments) -> dict[str, np.ndarray]:
-    """Labels of a demonstration: ``<level>``, its options [T], and ``<level>_boundary``, 1 at each new choice [T].
+    """Labels of a demonstration: ``<level>``, its options [T], and ``<level>_boundary``, 1 at each new choice
+    [T].
 
     ``<level>_source``, who says so, likewise.
     """
@@ -48,7 +49,8 @@ def labels_of(demo: Segments) -> dict[str, np.ndarray]:
 def check(asked: Asked) -> None:
     """Check that the labels can be written into the file, or into a copy of it.
 
-    :raises BadInput: the copy's place is taken, or a demonstration has labels of that name from another source.
+    :raises BadInput: the copy's place is taken, or a demonstration has labels of that name from another
+        source.
     """
     if not _same(asked.out, asked.source.path):
         check_copy("robomimic", asked.out, asked.source.path)
@@ -104,7 +106,9 @@ def write(asked: Asked, segmented: Segmented) -> str:
                         file["data"][name].attrs[mark] = marks[mark]
             if segmented.marks:
                 file.pop(f"mask/{EXCLUDE}", None)
-                leave_out(file, left_out := [name for name, marks in segmented.marks.items() if EXCLUDE in marks])
+                leave_out(
+                    file, left_out := [name for name, marks in segmented.marks.items() if EXCLUDE in marks]
+                )
                 if left_out:
                     file[f"mask/{EXCLUDE}"] = np.array(left_out, "S")
             if (names := _names(segmented)) != label_names(attributes_of(file["data"]) | attributes_of(file)):
@@ -127,9 +131,13 @@ def leave_out(file: h5py.File, names: Collection[str]) -> None:
 
 def _names(segmented: Segmented) -> dict[str, list[str]]:
     """The names of the labels in the file, where labels of a level with named options have the names of its choices."""
-    known = {name: list(names) for name, names in segmented.label_names.items() if name not in segmented.counts}
+    known = {
+        name: list(names) for name, names in segmented.label_names.items() if name not in segmented.counts
+    }
     levels = segmented.names.items()
-    return known | {level: list(names) for level, names in levels if tuple(names) != choice_names(len(names) - 1)}
+    return known | {
+        level: list(names) for level, names in levels if tuple(names) != choice_names(len(names) - 1)
+    }
 
 
 def _same(out: Path, path: Path) -> bool:

@@ -62,8 +62,8 @@ def check(asked: Asked) -> None:
 def write(asked: Asked, segmented: Segmented) -> str:
     """``subtask_term_signals/<subtask>`` [T] beside the tool's data of each demonstration.
 
-    A signal is 0, and 1 from the last step of its subtask on. The last subtask of a demonstration has none. The copy
-    has only demonstrations whose subtasks follow one order.
+    A signal is 0, and 1 from the last step of its subtask on. The last subtask of a demonstration has none.
+    The copy has only demonstrations whose subtasks follow one order.
     """
     names, runs = _one_order(asked, segmented)
     with whole_file(asked.out) as temporary:
@@ -90,8 +90,8 @@ def write(asked: Asked, segmented: Segmented) -> str:
 def _one_order(asked: Asked, segmented: Segmented) -> tuple[list[str], dict[str, list[Run]]]:
     """The subtasks that demonstrations go through, and the runs of each demonstration that does so.
 
-    A subtask that occurs twice has a number the second time, such as ``grasp_2``. The first one lasts at least two
-    steps: MimicGen looks for the step where its signal rises.
+    A subtask that occurs twice has a number the second time, such as ``grasp_2``. The first one lasts at
+    least two steps: MimicGen looks for the step where its signal rises.
     """
     runs = {demo.name: asked.runs(demo) for demo in segmented.segments}
     subtasks = {name: [asked.names[option] for option, _, _ in each] for name, each in runs.items()}
@@ -104,7 +104,9 @@ def _one_order(asked: Asked, segmented: Segmented) -> tuple[list[str], dict[str,
         elif each[0][2] == 1:
             problems[name] = f"its first subtask, {common[0]}, lasts one step, whose end cannot be marked"
     if len(common) == 1:
-        raise BadInput(f"{asked.option}: most demonstrations have one subtask, {common[0]}: there is no end to mark")
+        raise BadInput(
+            f"{asked.option}: most demonstrations have one subtask, {common[0]}: there is no end to mark"
+        )
     if problems and not (asked.same_order and len(problems) < len(runs)):
         name, problem = next(iter(problems.items()))
         raise BadInput(

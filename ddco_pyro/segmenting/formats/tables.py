@@ -20,7 +20,8 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def table(segmented: Segmented) -> pandas.DataFrame:
-    """A row for each step: of each level the option, whether it is a new choice, its probability and its name.
+    """A row for each step: of each level the option, whether it is a new choice, its probability and its
+    name.
 
     Then comes who says so, where a person labelled.
     """

@@ -52,14 +52,16 @@ def spoil(path: Path, place: str, chunk: int = 0) -> None:
     path.write_bytes(content)
 
 
-# --- parts elsewhere --------------------------------------------------------------------------------------------------
+# --- parts elsewhere ----------------------------------------------------------------------------------------
 
 
 def raw(group: h5py.Group, folder: Path) -> None:
     """Controls in a raw file."""
     (folder / "actions.raw").write_bytes(group["actions"][:].tobytes())
     del group["actions"]
-    group.create_dataset("actions", (STEPS, 2), "f8", external=[(str(folder / "actions.raw"), 0, STEPS * 2 * 8)])
+    group.create_dataset(
+        "actions", (STEPS, 2), "f8", external=[(str(folder / "actions.raw"), 0, STEPS * 2 * 8)]
+    )
 
 
 def linked(group: h5py.Group, folder: Path, place: str, key: str) -> None:
@@ -89,7 +91,7 @@ def circle(group: h5py.Group, folder: Path) -> None:
     group["obs/again"] = group["obs"]
 
 
-# --- what is claimed --------------------------------------------------------------------------------------------------
+# --- what is claimed ----------------------------------------------------------------------------------------
 
 
 def rows_claimed(group: h5py.Group, folder: Path) -> None:
@@ -107,7 +109,7 @@ def chunk_missing(group: h5py.Group, folder: Path) -> None:
     dataset[: STEPS - 1] = 1.0
 
 
-# --- specs ------------------------------------------------------------------------------------------------------------
+# --- specs --------------------------------------------------------------------------------------------------
 
 
 def pipe(folder: Path, name: str = "spec.yaml") -> Path:
@@ -139,7 +141,8 @@ ROWS: dict[str, Row] = {
     "external storage": Row(changed(raw), REPACK.format("demo_1: actions is stored in another file")),
     "virtual": Row(changed(virtual), REPACK.format("demo_1: obs/offsets is virtual")),
     "external link to an array": Row(
-        changed(linked, "/data/demo_0/obs/offsets", "data/demo_1/obs/offsets"), LINK.format("/data/demo_0/obs/offsets")
+        changed(linked, "/data/demo_0/obs/offsets", "data/demo_1/obs/offsets"),
+        LINK.format("/data/demo_0/obs/offsets"),
     ),
     "external link to a demonstration": Row(
         changed(linked, "/data/demo_0", "data/demo_1"), LINK.format("/data/demo_0")
@@ -147,8 +150,12 @@ ROWS: dict[str, Row] = {
     "dangling link": Row(changed(soft, "data/demo_1", "demo_9"), LINK.format("demo_9")),
     "hard link": Row(changed(twice), None),
     "a group in itself": Row(changed(circle), "demo_1: obs/again: its groups go in a circle"),
-    "1e12 rows": Row(changed(rows_claimed), "demo_1: actions claims 100000000 chunks, but the file holds 1; write"),
-    "a chunk missing": Row(changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"),
+    "1e12 rows": Row(
+        changed(rows_claimed), "demo_1: actions claims 100000000 chunks, but the file holds 1; write"
+    ),
+    "a chunk missing": Row(
+        changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"
+    ),
     "a pipe": Row(partial(pipe, name="demos.hdf5"), r"is neither a regular file nor a folder"),
     "spec: a device": Row(endless, r"is no file of at most 256 kB"),
     "spec: large": Row(text("a: [" + "1, " * 500_000 + "]"), r"is no file of at most 256 kB"),

@@ -120,7 +120,9 @@ def _integers(steps: int, number: int, least: int, most: int, columns: int | Non
 
 def _bytes(*shape: int, dtype: str = "u1") -> Callable[[int, int], np.ndarray]:
     high = np.iinfo(dtype).max
-    return lambda steps, number: np.random.default_rng(number).integers(0, high, (steps, *shape)).astype(dtype)
+    return lambda steps, number: (
+        np.random.default_rng(number).integers(0, high, (steps, *shape)).astype(dtype)
+    )
 
 
 ROWS: dict[str, Row] = {
@@ -129,10 +131,13 @@ ROWS: dict[str, Row] = {
         says="demo_1 is in mask/train and in mask/valid",
         masks={"train": [b"demo_0", b"demo_1", b"demo_2"], "valid": [b"demo_1", b"demo_3"]},
     ),
-    "a mask names a stranger": _row(says="valid: there is no demonstration 'demo_9'", masks={"valid": [b"demo_9"]}),
+    "a mask names a stranger": _row(
+        says="valid: there is no demonstration 'demo_9'", masks={"valid": [b"demo_9"]}
+    ),
     "an empty mask": _row(says="no demonstration is left to validate with", masks={"valid": []}),
     "a mask of all": _row(
-        says="no demonstration is left to train with", masks={"valid": [b"demo_%d" % n for n in range(NUMBER)]}
+        says="no demonstration is left to train with",
+        masks={"valid": [b"demo_%d" % n for n in range(NUMBER)]},
     ),
     "one to train with": _row(
         says="1 demonstration is left to train with", masks={"train": [b"demo_1"], "valid": [b"demo_2"]}
@@ -151,13 +156,16 @@ ROWS: dict[str, Row] = {
     "grey": _row(put("obs/camera", _bytes(12, 10))),
     "grey alone": _row(alone("obs/camera", _bytes(12, 10))),
     "16-bit depth": _row(put("obs/depth", _bytes(12, 10, dtype="u2"))),
-    "16-bit depth alone": _row(alone("obs/depth", _bytes(12, 10, dtype="u2")), says="no observation can be used"),
+    "16-bit depth alone": _row(
+        alone("obs/depth", _bytes(12, 10, dtype="u2")), says="no observation can be used"
+    ),
     # --- controls
     "integers -1, 0, 1": _row(put("actions", lambda steps, number: _integers(steps, number, -1, 1))),
     "integers [T]": _row(put("actions", lambda steps, number: _integers(steps, number, 0, 3, None))),
     "integers of two columns": _row(put("actions", lambda steps, number: _integers(steps, number, -1, 2, 2))),
     "floats [T]": _row(
-        put("actions", lambda steps, number: _half(steps).astype("f4")), says=r"actions is float32 of shape \[steps\]"
+        put("actions", lambda steps, number: _half(steps).astype("f4")),
+        says=r"actions is float32 of shape \[steps\]",
     ),
     "a switch padded by zeros": _row(
         with_switch(lambda steps, n: np.where(np.arange(steps) < steps - 2, np.where(_half(steps), -1, 1), 0))
@@ -165,7 +173,9 @@ ROWS: dict[str, Row] = {
     "two conventions of a switch": _row(
         with_switch(lambda steps, number: np.where(_half(steps), -1 if number < 3 else 0, 1))
     ),
-    "controls of another size in one": _row(_another_size, says=r"actions (is in 4 of 5 demonstra|has shape \(1,\))"),
+    "controls of another size in one": _row(
+        _another_size, says=r"actions (is in 4 of 5 demonstra|has shape \(1,\))"
+    ),
     "a number that single precision does not hold": _row(_huge),
     "no control that moves": _row(
         put("actions", lambda steps, number: np.ones((steps, 2))), says="every dimension is constant"

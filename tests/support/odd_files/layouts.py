@@ -170,7 +170,9 @@ ROWS = {
     ),
     "zarr": Row(zarr, r"is a zarr store, as diffusion policy writes them; .*docs/own\.md"),
     "tfds": Row(tfds, r"is a TensorFlow dataset \(RLDS\); .*docs/own\.md"),
-    "mcap": Row(lambda folder: within(folder, "x.mcap") / "x.mcap", r"is a recording of ROS: .* rosbags.*docs/own\.md"),
+    "mcap": Row(
+        lambda folder: within(folder, "x.mcap") / "x.mcap", r"is a recording of ROS: .* rosbags.*docs/own\.md"
+    ),
     "RoboMIND": Row(
         lambda folder: hdf5(folder, "puppet/joint_position", "master/joint_position"),
         r"has the layout of RoboMIND, with observations in puppet and controls in master; .*docs/own\.md",
@@ -180,6 +182,8 @@ ROWS = {
         "has the layout of AgiBot World, with observations in state and controls in action",
     ),
     "RoboSet": Row(lambda folder: hdf5(folder, "Trial0/data/qp_arm"), "has the layout of RoboSet"),
-    "lerobot v2": Row(lerobot_v2, r"v2\.1, and v3\.x can be read; .*: python -m lerobot\..*convert_dataset_v21_to_v30"),
+    "lerobot v2": Row(
+        lerobot_v2, r"v2\.1, and v3\.x can be read; .*: python -m lerobot\..*convert_dataset_v21_to_v30"
+    ),
     "strange name": Row(strange, "is a folder of no known format"),
 }

@@ -60,7 +60,9 @@ def column(name: str, **about: object) -> Change:
 
     def change(dataset: Path) -> None:
         feature(name, **{"shape": [1], "names": None} | about)(dataset)
-        rewritten(DATA, lambda table: table.append_column(name, pyarrow.array(map(float, range(len(table))))))(dataset)
+        rewritten(
+            DATA, lambda table: table.append_column(name, pyarrow.array(map(float, range(len(table)))))
+        )(dataset)
 
     return change
 
@@ -81,13 +83,16 @@ def renamed(old: str, new: str) -> Change:
     def change(dataset: Path) -> None:
         features = json.loads((dataset / "meta" / "info.json").read_text())["features"]
         info(features={new if name == old else name: about for name, about in features.items()})(dataset)
-        rewritten(DATA, lambda table: table.rename_columns([{old: new}.get(c, c) for c in table.column_names]))(dataset)
+        rewritten(
+            DATA, lambda table: table.rename_columns([{old: new}.get(c, c) for c in table.column_names])
+        )(dataset)
 
     return change
 
 
 WITHOUT_VIDEOS = rewritten(
-    EPISODES, lambda table: table.drop_columns([name for name in table.column_names if name.startswith("videos/")])
+    EPISODES,
+    lambda table: table.drop_columns([name for name in table.column_names if name.startswith("videos/")]),
 )
 """Nothing says where the videos are."""
 
@@ -99,7 +104,9 @@ def episode(index: int, key: str, value: object) -> Change:
         values = table[key].to_pylist()
         values[index] = value
         at = table.column_names.index(key)
-        return table.set_column(at, table.schema.field(at), pyarrow.array(values, table.schema.field(at).type))
+        return table.set_column(
+            at, table.schema.field(at), pyarrow.array(values, table.schema.field(at).type)
+        )
 
     return rewritten(EPISODES, change)
 
@@ -190,15 +197,24 @@ DROPPED = without_rows(7), episode(1, "length", 5)
 """A frame of episode 1 is gone, and everything that counts says so."""
 
 EPISODES_NOT_WHOLE = {
-    "lerobot dropped frame": (changed(without_rows(7)), "demo_1: length in meta/episodes is 6, and .* has 5 rows"),
-    "lerobot dropped frame, length corrected": (changed(*DROPPED), "demo_1: frame_index has a gap before row 2: 1,"),
+    "lerobot dropped frame": (
+        changed(without_rows(7)),
+        "demo_1: length in meta/episodes is 6, and .* has 5 rows",
+    ),
+    "lerobot dropped frame, length corrected": (
+        changed(*DROPPED),
+        "demo_1: frame_index has a gap before row 2: 1,",
+    ),
     "lerobot dropped frame, counted anew": (
         changed(*DROPPED, rewritten(DATA, renumbered)),
         r"demo_1: timestamp has a gap before row 2: 0\.1, then 0\.3",
     ),
     "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index steps back in row 1: 5, then 4"),
     "lerobot no rows": (changed(without_rows(*range(5, 11))), "demo_1: its rows are missing in"),
-    "lerobot ragged": (changed(RAGGED), "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct"),
+    "lerobot ragged": (
+        changed(RAGGED),
+        "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct",
+    ),
     "lerobot late": (
         in_episode_1("timestamp", lambda _, value: value + 3.2),
         r"demo_1: timestamp is 3\.2 in row 0, not 0; correct it, or fps",
@@ -222,7 +238,9 @@ ROWS = {
     "lerobot key with a NUL": Row(changed(feature("observation.a\0b")), "which cannot be stored; rename it"),
     "lerobot key twice": Row(changed(column("observation.images/top")), None),
     "lerobot key below another": Row(changed(column("observation.state.x")), None),
-    "lerobot feature without a column": Row(changed(feature("observation.x")), r"demo_0: has no column observation\.x"),
+    "lerobot feature without a column": Row(
+        changed(feature("observation.x")), r"demo_0: has no column observation\.x"
+    ),
     "lerobot without a control": Row(
         changed(renamed("action", "action.continuous")),
         "there is no feature 'action'.*; there is: observation.state, action.continuous; .* --action action.continuous",
