@@ -61,10 +61,12 @@ class Model(BaseModel):
 
 
 def bare(key: str, allowed: Any) -> BeforeValidator:
-    """A validator that reads a bare string as ``{key: string}``; the JSON Schema shows the type ``allowed``."""
-    return BeforeValidator(
-        lambda value: {key: value} if isinstance(value, str) else value, json_schema_input_type=allowed
-    )
+    """A validator that reads a bare string as ``{key: string}``; the JSON Schema has the type ``allowed``."""
+
+    def read(value: Any) -> Any:
+        return {key: value} if isinstance(value, str) else value
+
+    return BeforeValidator(read, json_schema_input_type=allowed)
 
 
 def nested(kinds: tuple[type, ...], inner: Any, text: str, names: tuple[str, ...] = ()) -> WrapValidator:
@@ -73,9 +75,8 @@ def nested(kinds: tuple[type, ...], inner: Any, text: str, names: tuple[str, ...
     Values of ``kinds`` are validated as ``inner`` alone, so that an error names the key inside. Of other
     invalid values the error says that they must be ``text``, and suggests the nearest of ``names``.
     """
-    adapter: TypeAdapter[Any] = TypeAdapter(
-        inner, config=None if isinstance(inner, type) else Model.model_config
-    )
+    config = None if isinstance(inner, type) else Model.model_config
+    adapter: TypeAdapter[Any] = TypeAdapter(inner, config=config)
 
     def choose(value: Any, validate_simple: ValidatorFunctionWrapHandler) -> Any:
         if isinstance(value, kinds):
@@ -165,18 +166,13 @@ def _path(location: Sequence[int | str]) -> str:
 def in_words(error: ErrorDetails) -> str:
     """The problem with a value, without its key path."""
     kind = "invalid_key" if "[key]" in error["loc"] else error["type"]
-    context = {
-        key: f"{value:.15g}" if isinstance(value, float) else value
-        for key, value in error.get("ctx", {}).items()
-    }
+    given = error.get("ctx", {})
+    context = {key: f"{value:.15g}" if isinstance(value, float) else value for key, value in given.items()}
     names = re.findall(r"'([^']*)'", context.get("expected", ""))
     context["names"] = " or ".join(names) or "true"
     expected = _MESSAGES.get(kind, error["msg"]).format(**context)
-    return (
-        expected
-        if kind == "missing"
-        else f"{expected}, got {show(error['input'])}{nearest(error['input'], names)}"
-    )
+    got = f", got {show(error['input'])}{nearest(error['input'], names)}"
+    return expected if kind == "missing" else expected + got
 
 
 def show(value: Any) -> str:
@@ -186,7 +182,7 @@ def show(value: Any) -> str:
 
 
 def _unknown(location: Sequence[int | str], whole: type[BaseModel]) -> str:
-    """The problem with an unknown key: the nearest valid key beside it is suggested, or all valid keys are listed."""
+    """The problem with an unknown key; suggests the nearest valid key beside it, or lists all valid keys."""
     *above, wrong = location
     valid = [key for model in _models_at(above, whole) for key in _fields(model)]
     close = difflib.get_close_matches(str(wrong), valid, n=1)

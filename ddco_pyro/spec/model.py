@@ -63,9 +63,7 @@ class HierarchySpec(Model):
     def networks(self) -> dict[str, Network]:
         """The networks above the trunk, or the observations, by key path."""
         levels = enumerate(self.levels)
-        of_levels = {
-            f"levels.{n}.{key}": network for n, level in levels for key, network in level.networks.items()
-        }
+        of_levels = {f"levels.{n}.{key}": one for n, level in levels for key, one in level.networks.items()}
         return {"meta_policy": self.meta_policy} | of_levels
 
     def read_by(self, level: int) -> tuple[str, ...]:
@@ -78,9 +76,7 @@ class HierarchySpec(Model):
     @field_validator("levels")
     @classmethod
     def _selecting_below(cls, levels: tuple[LevelSpec, ...]) -> tuple[LevelSpec, ...]:
-        policies = [
-            _emitting(level.policy, "options" if index else "control") for index, level in enumerate(levels)
-        ]
+        policies = [_emitting(level.policy, "options" if n else "control") for n, level in enumerate(levels)]
         pairs = zip(levels, policies, strict=True)
         return tuple(level.model_copy(update={"policy": policy}) for level, policy in pairs)
 
@@ -93,18 +89,15 @@ class HierarchySpec(Model):
         first: dict[str, int] = {}
         for index, level in enumerate(self.levels):
             if first.setdefault(level.name, index) < index:
-                text = (
-                    f"{level.name!r} is also the name of level {first[level.name]}; give each level its own"
-                )
+                other = first[level.name]
+                text = f"{level.name!r} is also the name of level {other}; give each level its own"
                 yield f"levels.{index}.name", text
         if self.levels[0].policy.emits != ("control",):
             yield "levels.0.policy.emits", "the lowest level emits the control and nothing else; leave it out"
         for place, head in self.networks.items() if self.trunk else ():
             if head.network not in HEADS:
-                yield (
-                    f"{place}.network",
-                    f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}",
-                )
+                text = f"reads the trunk: use one of {', '.join(HEADS)}, got {head.network!r}"
+                yield f"{place}.network", text
             elif head.inputs:
                 yield f"{place}.inputs", "the trunk reads the observations; give inputs there"
 

@@ -141,7 +141,8 @@ class ConvSpec(MlpSpec):
     """What is read of each map: the ``mean`` of 8 × 8 fields, all of the map (``flatten``), or the place
     where the map is active (``spatial_softmax``)."""
     standardize: bool = False
-    """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its pixels and channels."""
+    """Whether each picture is shifted and scaled to mean 0 and standard deviation 1 over its pixels and
+    channels."""
 
 
 class LstmSpec(LayeredSpec):
@@ -191,9 +192,8 @@ class UserNetworkSpec(Network):
     def _known(cls, name: str) -> str:
         if name == USER_DEFINED or not re.fullmatch(_USER_DEFINED_PATTERN, name):
             names = [*SETTINGS, USER_DEFINED]
-            raise invalid(
-                ("", f"no network is called {name!r}{nearest(name, names)}; use one of {', '.join(names)}")
-            )
+            text = f"no network is called {name!r}{nearest(name, names)}; use one of {', '.join(names)}"
+            raise invalid(("", text))
         return name
 
 

@@ -25,12 +25,11 @@ from ddco_pyro.spec.base import (
 )
 
 EACH = "demonstration"
-"""In place of an attribute in ``demonstrations.hold_out_by``: each demonstration is held out from a further fit."""
+"""In place of an attribute in ``hold_out_by``: each demonstration is held out from a further fit."""
 
 LabelNames = Annotated[Items[Text], Field(min_length=1)]
-Labels = Annotated[
-    Text | LabelNames, nested((list, tuple), LabelNames, "a name, or a list with a name for each level")
-]
+_LABELS = "a name, or a list with a name for each level"
+Labels = Annotated[Text | LabelNames, nested((list, tuple), LabelNames, _LABELS)]
 
 
 class DemonstrationsSpec(Model):
@@ -47,7 +46,7 @@ class DemonstrationsSpec(Model):
     supervisor: Text = "supervisor"
     """Which of the task's scripted policies is recorded."""
     valid_fraction: Share = 0.1
-    """Fraction of the demonstrations held out for validation, unless the file has ``mask/valid``; 0 for none."""
+    """Fraction of the demonstrations held out for validation, unless the file has ``mask/valid``; 0: none."""
     hold_out_by: Text | None = None
     """An attribute of demonstrations, such as the operator: all demonstrations with some of its values are
     held out, about ``valid_fraction`` of all, whatever masks the file has. The spec's ``seed`` draws the
@@ -57,7 +56,7 @@ class DemonstrationsSpec(Model):
     exclude: Items[Text] = ()
     """Names of demonstrations that are not read."""
     where: dict[str, Annotated[Items[Text], Field(min_length=1)]] = Field(default={})
-    """Attributes of demonstrations and their values, such as ``{task: [reach]}``: those with others are not read."""
+    """Attributes of demonstrations and their values, such as ``{task: [reach]}``; others are not read."""
     labels: Labels | None = None
     """Ground-truth labels in the file, with which discovered options are compared: one name for all levels,
     or a list with a name for each level, lowest first. Steps labelled −1 are ignored."""
@@ -93,10 +92,10 @@ class DemonstrationsSpec(Model):
 
 
 STEP = "step"
-"""The built-in observation: the number of the step divided by the steps of the longest training demonstration."""
+"""The built-in observation: number of the step divided by the steps of the longest training demonstration."""
 
 TASK = "task"
-"""The built-in observation: a number for each task of the demonstrations, 1 for its own and 0 for the others."""
+"""The built-in observation: a number for each task of the demonstrations, 1 for its own, 0 for the others."""
 
 
 Size = Annotated[Items[Count], Field(min_length=2, max_length=2)]
@@ -208,7 +207,8 @@ class DistributionSpec(Model):
     actions, as integers; ``auto``: chosen for each dimension from the demonstrations and shown by ``check``,
     never ``student``."""
     std: Std | None = None
-    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``; null in a part: as in ``control.std``."""
+    """Standard deviation σ in scaled units, or ``{learn: true, floor: ...}``; null in a part: that of
+    ``control.std``."""
 
 
 class PartSpec(DistributionSpec):
@@ -244,9 +244,8 @@ class ControlSpec(DistributionSpec):
     @property
     def learned_stds(self) -> dict[str, LearnedStd]:
         """Every learned σ by its key path in the spec."""
-        stds = {"control.std": self.std} | {
-            f"control.parts.{n}.std": part.std for n, part in enumerate(self.parts)
-        }
+        of_parts = {f"control.parts.{n}.std": part.std for n, part in enumerate(self.parts)}
+        stds = {"control.std": self.std} | of_parts
         return {path: std for path, std in stds.items() if isinstance(std, LearnedStd)}
 
     def problems(self) -> Problems:
@@ -305,15 +304,14 @@ class PathSpec(NamedTuple):
         return self.key if self.numbers is None else f"{self.key}[{self.numbers}]"
 
     def among(self, size: int) -> list[int]:
-        """The places of the path's numbers in a vector of so many; at most as many as the slice has within it."""
+        """The places of the path's numbers in a vector of ``size``: those of the slice that are within it."""
         ends = (self.numbers or ":3").split(":")
         return list(range(size)[slice(*(int(end) if end else None for end in ends))])
 
 
 def _paths(value: Any) -> Any:
-    return tuple(
-        _path(one) for one in (value if isinstance(value, list | tuple) and not _is_pair(value) else (value,))
-    )
+    several = isinstance(value, list | tuple) and not _is_pair(value)
+    return tuple(_path(one) for one in (value if several else (value,)))
 
 
 def _path(value: Any) -> PathSpec:
@@ -330,10 +328,9 @@ def _written(paths: tuple[PathSpec, ...] | None) -> Any:
 
 def _is_pair(value: Any) -> bool:
     """Whether a value is ``[key, slice]``."""
-    texts = (
-        isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(part, str) for part in value)
-    )
-    return texts and SLICE.fullmatch(value[1]) is not None
+    if not isinstance(value, list | tuple) or [isinstance(part, str) for part in value] != [True, True]:
+        return False
+    return SLICE.fullmatch(value[1]) is not None
 
 
 Trajectory = Annotated[

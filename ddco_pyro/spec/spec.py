@@ -77,7 +77,7 @@ class Spec(Model):
 
     @property
     def observed(self) -> list[str]:
-        """Names of the observations that demonstrations must hold: all except the built-in ``step`` and ``task``."""
+        """Names of the observations that demonstrations must hold: all except the built-in ones."""
         named = (name for each in self.observations for name in (each.key, each.minus))
         return [*dict.fromkeys(name for name in named if name not in (None, STEP, TASK))]
 
@@ -116,21 +116,15 @@ class Spec(Model):
         if self.hierarchy is None and self.baseline is None:
             yield "hierarchy", "missing; declare a hierarchy, or a baseline in its place"
         if self.hierarchy is not None and self.baseline is not None:
-            yield (
-                "baseline",
-                "stands beside hierarchy; keep one of the two (compare_with takes baselines to compare)",
-            )
+            text = "stands beside hierarchy; keep one of the two (compare_with takes baselines to compare)"
+            yield "baseline", text
         baseline = self.baseline
         if baseline and baseline.kind == "mixture":
-            yield (
-                "baseline",
-                "mixture takes its experts from a hierarchy; declare one, with termination: always",
-            )
+            text = "mixture takes its experts from a hierarchy; declare one, with termination: always"
+            yield "baseline", text
         if baseline and baseline.kind == "flat_equal" and "hidden" not in baseline.policy.model_fields_set:
-            yield (
-                "baseline",
-                "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat",
-            )
+            text = "flat_equal takes its size from a hierarchy; list it in compare_with there, or say flat"
+            yield "baseline", text
         if baseline and baseline.optimizer:
             yield "baseline.optimizer", "is for baselines in compare_with; give it in training.optimizer"
         if baseline and baseline.std:
@@ -151,10 +145,8 @@ class Spec(Model):
             elif not any(level.lasts for level in self.levels):
                 yield place, "the hierarchy is a mixture already: none of its options lasts; leave it out"
         if self.compare_with and not self.demonstrations.validates:
-            yield (
-                "compare_with",
-                "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction",
-            )
+            text = "needs held-out demonstrations to compare on; raise demonstrations.valid_fraction"
+            yield "compare_with", text
 
     def _observed(self) -> Problems:
         keys = [observation.name for observation in self.observations]
@@ -162,10 +154,8 @@ class Spec(Model):
             if key in keys[:index]:
                 yield f"observations.{index}.key", f"{key!r} is given twice; keep one"
         if not self.observed:
-            yield (
-                "observations",
-                f"{' and '.join(keys)} alone says nothing about the state; name an observation beside it",
-            )
+            text = f"{' and '.join(keys)} alone says nothing about the state; name an observation beside it"
+            yield "observations", text
         named = [("report.trajectory", path.key) for path in self.report.trajectory or ()]
         named += [("control.relative_to", self.control.relative_to)] if self.control.relative_to else []
         for place, key in dict.fromkeys(named):
@@ -179,8 +169,8 @@ class Spec(Model):
     def _labelled(self) -> Problems:
         names, known = self.demonstrations.labels, [level.name for level in self.levels]
         if known and isinstance(names, tuple) and len(names) != len(known):
-            text = f"must have a name for each of {len(known)} levels, or be one name for all, got {show([*names])}"
-            yield "demonstrations.labels", text
+            text = f"must have a name for each of {len(known)} levels, or be one name for all"
+            yield "demonstrations.labels", f"{text}, got {show([*names])}"
         if self.training.labels is None:
             return
         name = self.training.labels.level
@@ -315,7 +305,7 @@ def _set_model(data: dict[str, Any], value: Any) -> None:
 
 
 def plain(data: Any) -> Any:
-    """A deep copy of plain data, with dicts for mappings, lists for sequences, and Python's numbers for numpy's."""
+    """A deep copy of plain data: dicts for mappings, lists for sequences, Python's numbers for numpy's."""
     if isinstance(data, Mapping):
         return {key: plain(value) for key, value in data.items()}
     data = data.tolist() if hasattr(data, "tolist") else data
@@ -323,7 +313,7 @@ def plain(data: Any) -> Any:
 
 
 def _find(data: dict[str, Any], path: str) -> tuple[Any, Any]:
-    """The mapping or list that holds the value at a key path, and its key there; missing mappings are made."""
+    """The mapping or list that holds the value at a key path, and its key there. Makes missing mappings."""
     parts = path.split(".")
     if path.startswith(_GRID):  # keys of the grid contain dots
         parts = [*_GRID.split(".")[:-1], path.removeprefix(_GRID)]
@@ -336,9 +326,8 @@ def _find(data: dict[str, Any], path: str) -> tuple[Any, Any]:
             node[key] = {_BARE[parts[0]]: node[key]}
         if not isinstance(node[key], dict | list):
             parent = ".".join(parts[: depth + 1])
-            raise SpecError(
-                f"{path}: cannot be set, because {parent} is {show(node[key])}; set the whole of {parent}"
-            )
+            text = f"cannot be set, because {parent} is {show(node[key])}; set the whole of {parent}"
+            raise SpecError(f"{path}: {text}")
         node = node[key]
     return node, _key(node, parts[-1], path)
 
@@ -348,6 +337,5 @@ def _key(node: Any, part: str, path: str) -> Any:
         return part
     if part.isdecimal() and int(part) < len(node):
         return int(part)
-    raise SpecError(
-        f"{path}: {part!r} is not the number of one of the {len(node)} items there (the first is 0)"
-    )
+    text = f"{part!r} is not the number of one of the {len(node)} items there (the first is 0)"
+    raise SpecError(f"{path}: {text}")

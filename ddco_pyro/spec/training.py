@@ -44,27 +44,24 @@ class OptimizerSpec(Model):
 
 
 class RecogniserSpec(Model):
-    """A recogniser of the options of labelled steps, whose evidence places the options of steps without labels."""
+    """A recogniser of the options of labelled steps; its evidence places the options of unlabelled steps."""
 
     weight: float = Field(default=0.3, ge=0)
-    """γ: how many times log r(h | window) − log p(h) counts, beside the control's log-density (``control.power``)."""
+    """γ: how many times log r(h | window) − log p(h) counts, beside the control's log-density
+    (``control.power``)."""
     ridge: Positive = 50.0
     """Precision of a normal prior on the weights of standardised features."""
 
 
+_RECOGNISER = "a mapping with weight and ridge, or cross_validated"
 RecogniserOf = Annotated[
     RecogniserSpec | Literal["cross_validated"] | None,
-    nested(
-        (Mapping,),
-        RecogniserSpec,
-        "a mapping with weight and ridge, or cross_validated",
-        ("cross_validated",),
-    ),
+    nested((Mapping,), RecogniserSpec, _RECOGNISER, ("cross_validated",)),
 ]
 
 
 class LabelsSpec(Model):
-    """Labels that fix the active option of one level; steps labelled −1 are free. Those held out are never used."""
+    """Labels that fix the active option of one level; steps labelled −1 are free. None held out is used."""
 
     model_config = ConfigDict(serialize_by_alias=True)
 
@@ -79,7 +76,9 @@ class LabelsSpec(Model):
 
 
 class LibrarySpec(Model):
-    """A library: a run whose model is the prior of this one. Encoder, scaling and kinds of controls are the run's."""
+    """A library: a run whose model is the prior of this one. Encoder, scaling and kinds of controls are the
+    run's.
+    """
 
     run: Text
     """The run folder. Its model, or one of its baselines, has the same observations, control and networks."""

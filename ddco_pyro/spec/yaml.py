@@ -17,15 +17,14 @@ from ddco_pyro.spec.spec import Spec, parse_spec, plain
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads numbers as YAML 1.2 does, ``1e-3``, ``010`` (ten) and ``1:30`` (text), and refuses duplicate keys."""
+    """Reads ``1e-3``, ``010`` (ten) and ``1:30`` (text) as YAML 1.2 does, and refuses duplicate keys."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key.value!r} is given twice", key.start_mark
-                )
+                text = f"key {key.value!r} is given twice"
+                raise yaml.constructor.ConstructorError(None, None, text, key.start_mark)
             seen.add(key.value if isinstance(key, yaml.ScalarNode) else None)
         return super().construct_mapping(node, deep=deep)
 
@@ -61,8 +60,7 @@ _Loader.add_constructor(_INT, _whole)
 
 
 def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
-    """The spec in a YAML file, after ``overrides`` such as ``"hierarchy.levels.0.count=3"`` (the value is
-    YAML).
+    """The spec in a YAML file, after ``overrides`` such as ``"hierarchy.levels.0.count=3"``, a YAML value.
 
     Code that the spec names is not imported.
 
@@ -70,8 +68,7 @@ def load_spec(path: str | Path, overrides: Iterable[str] = (), allow_code: bool 
     >>> spec.hierarchy.levels[0].count, spec.training.batch_size
     (3, 16)
 
-    :param allow_code: whether the spec may name user code (``module:name``), which later use of the spec
-        imports.
+    :param allow_code: whether the spec may name user code (``module:name``), which its later use imports.
     :raises SpecError: the file cannot be read, is not YAML, is not a valid spec, or names code that is not
         allowed; one line for each problem.
     """
@@ -136,10 +133,7 @@ def read_yaml(content: bytes | str) -> Any:
         raise SpecError(f"{where}not valid YAML: {error.problem or error.context}") from None
     except RecursionError:
         raise SpecError("not valid YAML: nested too deeply") from None
-    except (
-        yaml.YAMLError,
-        ValueError,
-    ) as error:  # not text, or a date or number that Python cannot represent
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not text, or a date or number out of range
         raise SpecError(f"not valid YAML: {' '.join(str(error).split())}") from None
 
 
@@ -161,8 +155,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 
 def user_code(spec: Spec) -> dict[str, str]:
-    """Key path to ``module:name`` of the code that using the spec imports: its tasks and networks, the grid
-    excluded.
+    """Key path to ``module:name`` of the code that using the spec imports: tasks and networks, not the grid.
 
     Tasks registered by installed packages are not user code.
     """
