@@ -1,4 +1,4 @@
-"""Labels of a table: a row for each segment that a person marked, with a demonstration, a label, a start and a stop."""
+"""Labels of a table: a row for each segment that a person marked: demonstration, label, start and stop."""
 
 from __future__ import annotations
 
@@ -48,8 +48,7 @@ Labelled = dict[str, dict[str, np.ndarray]]
 
 
 def labels_of_table(table: LabelTable, source: Source) -> tuple[Labelled, dict[str, list[str]], list[str]]:
-    """The labels that a table gives to the demonstrations of a source, whose names of labels keep their
-    numbers.
+    """The labels that a table gives to a source's demonstrations; the source's labels keep their numbers.
 
     :returns: the labels, the names of labels 0, 1, ... of the table and of the source, and a line for each
         thing in the table that is left out, or read in another way.
@@ -113,8 +112,7 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _segments(table: pd.DataFrame, said: Mapping[str, str]) -> tuple[pd.DataFrame, str | None, list[str]]:
-    """Segments, the unit of their times (None where the table does not say it), and a line for each thing
-    left out.
+    """Segments, the unit of their times (None if the table is silent), and a line for each thing left out.
 
     A segment is a row with ``demonstration``, ``labels`` (their name), ``label``, ``start``, ``stop``, and
     ``last``, which says whether the step of ``stop`` is a part of it.
@@ -146,15 +144,13 @@ def _segments(table: pd.DataFrame, said: Mapping[str, str]) -> tuple[pd.DataFram
 
 
 def _aggregated(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """BORIS' tabular events as its aggregated ones: a row for each START with the STOP that is next of its
-    behavior.
+    """BORIS' tabular events as its aggregated ones: a row for each START with the next STOP of its behavior.
 
     Other tables stay. Events without a partner are left out, and a line names them.
     """
     ends = ["START", "STOP"]
-    kind = next(
-        (name for name in ("Behavior type", "Status") if name in table and table[name].isin(ends).any()), ""
-    )
+    columns = [name for name in ("Behavior type", "Status") if name in table]
+    kind = next((name for name in columns if table[name].isin(ends).any()), "")
     if not kind or not {"Observation id", "Subject", "Behavior", "Time"} <= {*table}:
         return table, []
     times = _numbers(table, "Time")
@@ -164,9 +160,8 @@ def _aggregated(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     starts = (events[kind] == "START") & (of_behavior[kind].shift(-1) == "STOP")
     stops = (events[kind] == "STOP") & (of_behavior[kind].shift(1) == "START")
     alone = events[~starts & ~stops]
-    states = events.assign(**{"Stop (s)": of_behavior["Stop (s)"].shift(-1), "Behavior type": "STATE"})[
-        starts
-    ]
+    next_stop = of_behavior["Stop (s)"].shift(-1)
+    states = events.assign(**{"Stop (s)": next_stop, "Behavior type": "STATE"})[starts]
     named = alone["Observation id"] + ": " + alone["Behavior"] + " " + alone[kind] + " at " + alone["Time"]
     notes = [f"left out events without a partner ({len(alone)}): {few([*named])}"] if len(alone) else []
     return pd.concat([states, table.drop(events.index)]).sort_index(), notes
@@ -179,9 +174,8 @@ def _states(rows: pd.DataFrame, table: pd.DataFrame) -> tuple[pd.DataFrame, list
     if "Time offset (s)" in table:
         before = _numbers(table[states], "Time offset (s)")
         rows = rows.assign(**{side: _numbers(rows, side) - before for side in ("start", "stop")})
-    modified = (
-        (table.loc[states, [name for name in table if name.startswith("Modifier")]] != "").any(axis=1).sum()
-    )
+    modifiers = [name for name in table if name.startswith("Modifier")]
+    modified = (table.loc[states, modifiers] != "").any(axis=1).sum()
     notes = [f"left out {(~states).sum()} point events, which last no step"] if not states.all() else []
     notes += [f"left out the modifiers of {modified} rows: a label is a behavior alone"] if modified else []
     return rows, notes
@@ -199,9 +193,8 @@ def _regions(table: pd.DataFrame, demonstrations: str) -> pd.DataFrame:
                 for region in json.loads(cell) if cell.startswith("[{") else ():
                     kind = next((kind for kind in REGIONS if kind in region), None)
                     if kind and len(region[kind]) > 1:
-                        raise BadInput(
-                            f"{demo}: a region of {labels} has {len(region[kind])} labels; a step has one"
-                        )
+                        several = f"a region of {labels} has {len(region[kind])} labels"
+                        raise BadInput(f"{demo}: {several}; a step has one")
                     for part in region.get("ranges", [region]) if kind else ():
                         start = part["start"] - ("ranges" in region)
                         last = kind == "timeserieslabels"
@@ -230,18 +223,15 @@ def _in_steps(rows: pd.DataFrame, unit: str | None, rate: float | None) -> pd.Da
     rows = rows.assign(start=start, stop=stop + rows["last"])
     after = rows.sort_values("start", kind="stable").groupby(["labels", "demonstration"])["start"].shift(-1)
     after = after.reindex(rows.index)
-    shared = (
-        rows["last"] & (rows["start"] < after) & (after == rows["stop"] - 1)
-    )  # an edge drawn once for both
+    shared = rows["last"] & (rows["start"] < after) & (after == rows["stop"] - 1)  # an edge drawn once
     return rows.assign(stop=rows["stop"] - shared)
 
 
 def _numbers(rows: pd.DataFrame, column: str) -> pd.Series:
     numbers = pd.to_numeric(rows[column], errors="coerce")
     if (bad := ~np.isfinite(numbers)).any():
-        raise BadInput(
-            f"row {bad.idxmax() + 1}: the {column} {rows[column][bad.idxmax()]!r} is no number; correct it"
-        )
+        row = bad.idxmax()
+        raise BadInput(f"row {row + 1}: the {column} {rows[column][row]!r} is no number; correct it")
     return numbers
 
 
@@ -254,7 +244,7 @@ def _spelling(labels: Iterable[str], known: Collection[str]) -> dict[str, str]:
 
 
 def _demonstration(said: str, names: Collection[str]) -> str:
-    """The demonstration that a table names, by itself or by a file, before which Label Studio puts a prefix."""
+    """The demonstration that a table names, by itself or by a file, which Label Studio gives a prefix."""
     stem = PurePath(unquote(urlsplit(said).path)).stem
     for name in (said, stem, stem.partition("-")[2]):
         if name in names:
@@ -270,9 +260,8 @@ def _painted(where: str, rows: pd.DataFrame, numbers: Mapping[str, int], steps: 
             lasts = f"lasts from step {row.start} to {row.stop}, but there are {steps} steps"
             raise BadInput(f"{where}: {row.label} {lasts}; correct it, the unit or --fps")
         if row.start == row.stop:
-            raise BadInput(
-                f"{where}: {row.label} at step {row.start} is shorter than a step; remove or lengthen it"
-            )
+            short = f"{row.label} at step {row.start} is shorter than a step"
+            raise BadInput(f"{where}: {short}; remove or lengthen it")
         if row.start < before:
             overlap = f"{row.label} and another segment overlap at step {row.start}"
             raise BadInput(f"{where}: {overlap}; a step has one label: end one of them")

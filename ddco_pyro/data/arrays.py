@@ -1,4 +1,4 @@
-"""Arrays [T, ...] of demonstrations, in memory or lazy: what networks read of them, and whether there is room."""
+"""Arrays [T, ...] of demonstrations, in memory or lazy: what networks read of them, whether there is room."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NUMBERS = "fiub"
 """Kinds of numpy types that are real numbers."""
 
 LARGEST = 1e30
-"""Largest usable number: networks are float32, which ends at 3e38, and variances are float64, which ends at 1e308."""
+"""Largest usable number: networks are float32, which ends at 3e38, variances float64, which ends at 1e308."""
 
 BLOCK_BYTES = 16 * 2**20
 """Most bytes of an array that are read at a time in a pass over the whole array; one step at least."""
@@ -37,8 +37,7 @@ PICTURES = np.dtype(np.uint8)
 
 @dataclass(frozen=True)
 class LazyArray:
-    """An array [T, ...] that is read when it is asked for: a slice of its steps, or all of it by
-    ``np.asarray``.
+    """An array [T, ...] that is read when asked for: a slice of its steps, or all of it by ``np.asarray``.
 
     :param read: gives the steps from ``start`` to before ``stop`` in blocks.
     :param where: name in errors, such as ``demo_0: obs/camera``.
@@ -74,9 +73,8 @@ class LazyArray:
         return whole[::stride]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        refuse_too_much(
-            self.dtype.itemsize * math.prod(self.shape), self.where or "an array", "divide the episode"
-        )
+        size = self.dtype.itemsize * math.prod(self.shape)
+        refuse_too_much(size, self.where or "an array", "divide the episode")
         return self[:].astype(dtype or self.dtype, copy=False)
 
 
@@ -110,10 +108,8 @@ def same(left: Observed, right: Observed) -> bool:
     if left.shape != right.shape:
         return False
     at_once = block_steps(left.shape[1:], left.dtype)
-    firsts = range(0, len(left), at_once)
-    return all(
-        np.array_equal(left[first : first + at_once], right[first : first + at_once]) for first in firsts
-    )
+    parts = (slice(first, first + at_once) for first in range(0, len(left), at_once))
+    return all(np.array_equal(left[part], right[part]) for part in parts)
 
 
 def usable(values: np.ndarray) -> np.ndarray:
@@ -157,11 +153,9 @@ def turned(array: np.ndarray) -> np.ndarray:
     shape = channels_last(array.shape, array.dtype)
     if shape == array.shape:
         return array
-    return (
-        array[..., None]
-        if array.ndim == PICTURE_DIMENSIONS
-        else np.ascontiguousarray(np.moveaxis(array, 1, -1))
-    )
+    if array.ndim == PICTURE_DIMENSIONS:
+        return array[..., None]
+    return np.ascontiguousarray(np.moveaxis(array, 1, -1))
 
 
 # --- what networks read -------------------------------------------------------------------------------------
@@ -170,8 +164,7 @@ def turned(array: np.ndarray) -> np.ndarray:
 def network_input(
     shape: tuple[int, ...], dtype: np.dtype[Any] = PICTURES
 ) -> tuple[Literal["vector", "picture", ""], str]:
-    """What networks read of an observation whose steps have this shape and type, else why they read nothing
-    of it.
+    """What networks read of an observation whose steps have this shape and type, else why they read nothing.
 
     Real numbers of at most two dimensions are a vector, flattened. A picture is uint8 [H, W, C].
 
@@ -186,14 +179,14 @@ def network_input(
         return "vector", ""
     if len(shape) > PICTURE_DIMENSIONS:
         return "", (
-            f"has shape {list(shape)} at each step, and networks read vectors and pictures [H, W, C]; store one "
-            "picture a step, or reshape it to [steps, dimensions]"
+            f"has shape {list(shape)} at each step, and networks read vectors and pictures [H, W, C]; "
+            "store one picture a step, or reshape it to [steps, dimensions]"
         )
     if dtype == PICTURES:
         return "picture", ""
     return "", (
-        f"has shape {list(shape)} at each step and is not uint8, as pictures have to be; scale the range that "
-        "matters to it, such as (255 * (depth / far).clip(0, 1)).astype('uint8')"
+        f"has shape {list(shape)} at each step and is not uint8, as pictures have to be; scale the range "
+        "that matters to it, such as (255 * (depth / far).clip(0, 1)).astype('uint8')"
     )
 
 
@@ -222,14 +215,11 @@ def free(root: Path = Path("/")) -> float:
     """
     found = [float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))]
     try:
-        available = re.search(
-            r"^MemAvailable:\s+(\d+) kB$", (root / "proc/meminfo").read_text(), re.MULTILINE
-        )
+        facts = (root / "proc/meminfo").read_text()
+        available = re.search(r"^MemAvailable:\s+(\d+) kB$", facts, re.MULTILINE)
         found += [float(available[1]) * 1024] if available else []
-        group, top = (
-            (root / "proc/self/cgroup").read_text().strip().rpartition("::")[2],
-            root / "sys/fs/cgroup",
-        )
+        group = (root / "proc/self/cgroup").read_text().strip().rpartition("::")[2]
+        top = root / "sys/fs/cgroup"
         own = top / group.strip("/")
         limits = [part / "memory.max" for part in (own, *own.parents) if part.is_relative_to(top)]
         found += [float(file.read_text()) for file in limits if file.exists() and file.read_text() != "max\n"]
@@ -246,6 +236,5 @@ def refuse_too_much(needed: float, what: str, remedy: str) -> None:
     """
     if needed >= SMALL and needed > (there := free()):
         size = math.ceil(needed / 1e8) / 10
-        raise DemonstrationsError(
-            f"{what} takes about {size:g} GB of memory, and {there / 1e9:.4g} are free; {remedy}"
-        )
+        takes = f"{what} takes about {size:g} GB of memory"
+        raise DemonstrationsError(f"{takes}, and {there / 1e9:.4g} are free; {remedy}")

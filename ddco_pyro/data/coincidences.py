@@ -72,7 +72,7 @@ GENERATED = {
 
 
 NEAR = 0.25
-"""A target is this near to what it is a target of: the root mean square of their difference, in deviations of it."""
+"""A target is this near to what it targets: the root mean square of their difference, in deviations of it."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Beside:
     still: Sequence[int]
 
     def at(self, shift: int) -> tuple[np.ndarray, np.ndarray]:
-        """The observation [N, D] of all steps with a control so many steps later, and these controls [N, A]."""
+        """The observation [N, D] of steps with a control so many steps later, and these controls [N, A]."""
         pairs = zip(self.seen, self.controls, strict=True)
         whole = [(rows[:LOOKED_AT], commands[:LOOKED_AT]) for rows, commands in pairs]
         spans = [slice(max(-shift, 0), max(len(rows) - max(shift, 0), 0)) for rows, _ in whole]
@@ -126,11 +126,9 @@ class Beside:
 
     @property
     def followed(self) -> bool:
-        """Whether the control is a target of the observation: near to it at this or the next step, number by
-        number.
+        """Whether the control is a target of the observation: each number near it at this or the next step.
 
-        The observation has as many numbers, and their difference at the same step varies where the control
-        does.
+        The observation has as many numbers, and their difference at a step varies where the control does.
         """
         (seen, controls), (now, then) = self.at(0), self.at(-1)
         if seen.shape[1] != controls.shape[1] or len(now) < FEWEST:
@@ -146,7 +144,7 @@ class Beside:
 
     @property
     def clock(self) -> bool:
-        """Whether the observation is one number that rises as a clock does; one that is called so may step back."""
+        """Whether the observation is one number that rises as a clock does; one called so may step back."""
         if self.seen[0].shape[1] != 1:
             return False
         steps = [np.diff(rows[:LOOKED_AT, 0].astype(np.float64)) for rows in self.seen if len(rows) > 2]
@@ -165,13 +163,11 @@ class Beside:
         found = {shift: each for shift, each in self.told.items() if shift >= 0}
         if not rest or not rest <= {number for observed, _ in found.values() for number in observed}:
             return ""
-        controls = " and ".join(
-            f"control {listed(told)} {SHIFTS[shift][0]}" for shift, (_, told) in found.items()
-        )
-        return f"is {controls}, up to units and noise, which a policy has to predict"
+        controls = [f"control {listed(told)} {SHIFTS[shift][0]}" for shift, (_, told) in found.items()]
+        return f"is {' and '.join(controls)}, up to units and noise, which a policy has to predict"
 
     def notes(self) -> Iterator[str]:
-        """A line for each shift, where the observation holds controls among other numbers, or the one before."""
+        """A line for each shift: where the observation holds controls among others, or the one before."""
         for shift, (observed, controls) in self.told.items():
             effect = "tend to repeat it" if shift < 0 else "see what they have to predict"
             what = f"{self.place}: {listed(observed)} = control {listed(controls)} {SHIFTS[shift][0]}"
@@ -209,27 +205,22 @@ class Jumps:
     first: str
 
     def notes(self, place: str) -> Iterator[str]:
-        """A line for the angles of an array that jump by a turn, and for its quaternions that change their sign."""
+        """A line for angles of an array that jump by a turn, and for quaternions that change their sign."""
         where, seen = f"the first in {self.first}", place != "actions"
         for unit, numbers in self.angles.items():
-            remedy = (
-                f"with angles: {numbers} beside its key networks read sine and cosine"
-                if seen
-                else "unwrap it"
-            )
+            setting = f"with angles: {numbers} beside its key networks read sine and cosine"
+            remedy = setting if seen else "unwrap it"
             if seen and unit != "2π":
                 remedy = f"store radians; {remedy}"
             if numbers:
                 jump = f"jump{'s' * (len(numbers) == 1)} by {unit} as an angle"
                 yield f"{place}: {listed(numbers)} {jump}, {where}: {remedy}"
         if numbers := self.quaternions:
-            remedy = (
-                f"with quaternions: {numbers} beside its key networks read products, the same for q and −q"
-            )
-            yield (
-                f"{place}: {listed([first + part for first in numbers for part in range(4)])} change sign as a "
-                f"quaternion, {where}: {remedy if seen else 'give all rotations one sign'}"
-            )
+            parts = listed([first + part for first in numbers for part in range(4)])
+            setting = f"with quaternions: {numbers} beside its key"
+            setting += " networks read products, the same for q and −q"
+            remedy = setting if seen else "give all rotations one sign"
+            yield f"{place}: {parts} change sign as a quaternion, {where}: {remedy}"
 
 
 def jumps(each: Mapping[str, np.ndarray]) -> Jumps | None:
@@ -250,9 +241,8 @@ def jumps(each: Mapping[str, np.ndarray]) -> Jumps | None:
         quaternions: list[int] = []
         for place in np.flatnonzero(flips.any(0)).tolist():
             quaternions += [place] if not quaternions or place >= quaternions[-1] + 4 else []
-        free = ~np.isin(
-            np.arange(rows.shape[1]), [first + part for first in quaternions for part in range(4)]
-        )
+        parts = [first + part for first in quaternions for part in range(4)]
+        free = ~np.isin(np.arange(rows.shape[1]), parts)
         angles, jumped = {}, flips.any(1)
         for unit, turn in TURNS.items():
             by_turn = changes > NEARLY * turn

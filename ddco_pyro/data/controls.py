@@ -1,4 +1,4 @@
-"""Controls: statistics of each dimension over demonstrations, and the kind of distribution each dimension gets."""
+"""Controls: statistics of each dimension over demonstrations, and the kind of distribution that each gets."""
 
 from __future__ import annotations
 
@@ -79,8 +79,7 @@ class ControlDimension:
 
     :param number: index of the dimension, from 0.
     :param minimum: the smallest value, in the control's units; ``maximum`` likewise.
-    :param at_minimum: number of steps at the minimum within rounding (:data:`ROUNDING`); ``at_maximum``
-        likewise.
+    :param at_minimum: steps at the minimum within rounding (:data:`ROUNDING`); ``at_maximum`` likewise.
     :param steps: number of steps with finite values.
     :param distinct: the sorted values if there are at most :data:`MOST_DISTINCT`; else empty.
     :param inside: the commonest value strictly between the extremes; None without a common value.
@@ -89,8 +88,7 @@ class ControlDimension:
     :param integer: whether the controls have an integer type.
     :param made_by: for ``minimum``, ``maximum`` and ``inside``: names of the few demonstrations (:data:`FEW`)
         without which the value would be rare. Such a value decides no kind.
-    :param exceptions: names of the few demonstrations without which the dimension would be constant or a
-        switch.
+    :param exceptions: names of the few demonstrations without which it would be constant or a switch.
     """
 
     number: int
@@ -126,19 +124,16 @@ class ControlDimension:
 
     @property
     def extremes(self) -> tuple[tuple[str, float, float], ...]:
-        """(``minimum`` or ``maximum``, its value, share of the steps that equal it) for extremes that are
-        common.
+        """(``minimum`` or ``maximum``, its value, share of steps that equal it) for extremes that are common.
 
         Empty for discrete dimensions and for one or two values. An extreme that occurs once does not count,
         nor one that few demonstrations make.
         """
+        if self.values or self.discrete:
+            return ()
         ends = (("minimum", self.minimum, self.at_minimum), ("maximum", self.maximum, self.at_maximum))
-        often = [
-            (name, value, at / self.steps) for name, value, at in ends if at > max(1, OFTEN * self.steps)
-        ]
-        return (
-            () if self.values or self.discrete else tuple(end for end in often if end[0] not in self.made_by)
-        )
+        often = [end for end in ends if end[2] > max(1, OFTEN * self.steps) and end[0] not in self.made_by]
+        return tuple((name, value, at / self.steps) for name, value, at in often)
 
     @property
     def atom(self) -> str:
@@ -155,9 +150,8 @@ class ControlDimension:
             return ""
         each = ((getattr(self, end), names) for end, names in self.made_by.items())
         common = [f"{number(value)} is common in {few(names)} alone" for value, names in each]
-        return "; ".join(
-            [*common, *([f"a switch without {few(self.exceptions)}"] if self.exceptions else [])]
-        )
+        switch = [f"a switch without {few(self.exceptions)}"] if self.exceptions else []
+        return "; ".join([*common, *switch])
 
     @property
     def note(self) -> str:
@@ -166,10 +160,8 @@ class ControlDimension:
             return f"constant ({number(self.minimum)}): no part of the model, emitted as it is"
         if self.values:
             return f"takes two values, {number(self.minimum)} and {number(self.maximum)}"
-        ends = ", at its ".join(
-            f"{name} {number(value)} in {100 * share:.1f} % of the steps"
-            for name, value, share in self.extremes
-        )
+        shares = [f"{name} {number(value)} in {100 * share:.1f} %" for name, value, share in self.extremes]
+        ends = ", at its ".join(f"{share} of the steps" for share in shares)
         return "; ".join(filter(None, (self.atom, ends and f"exactly at its {ends}", self.made)))
 
     def as_data(self) -> dict[str, Any]:
@@ -183,8 +175,7 @@ def few(names: Sequence[str]) -> str:
 
 
 class _Steps:
-    """The values of one dimension over all steps [T]; ``starts`` [N] are the first steps of demonstrations by
-    name.
+    """The values of one dimension over all steps [T]; ``starts`` [N] are the first steps of demonstrations.
 
     ``low``, ``high``, ``at_low``, ``at_high`` and ``steps`` are the statistics of each demonstration, [N].
     """
@@ -225,11 +216,8 @@ class _Steps:
         values, times = np.unique(np.concatenate([self.low[two], self.high[two]]), return_counts=True)
         commonest = values[np.argsort(-times, kind="stable")]
         for count in (1, 2):
-            ends = [
-                np.any([same(end, value) for value in commonest[:count]], axis=0)
-                for end in (self.low, self.high)
-            ]
-            outside = np.flatnonzero(~(two & np.all(ends, 0)) & (self.steps > 0))
+            at = [[same(end, value) for end in (self.low, self.high)] for value in commonest[:count]]
+            outside = np.flatnonzero(~(two & np.any(at, axis=0).all(0)) & (self.steps > 0))
             if len(commonest) >= count and len(outside) <= most_few(len(self.steps)):
                 return tuple(self.names[place] for place in outside.tolist())
         return ()
@@ -238,12 +226,9 @@ class _Steps:
         """The commonest value between the extremes; one that few demonstrations make comes last."""
         often = self.times >= max(FEWEST, ATOM * len(self.values))
         ends = np.array([self.low.min(), self.high.max()])
-        values = [
-            value for value in (self.distinct[often] + 0.0).tolist() if not same(ends, value).any()
-        ]  # no minus 0
-        key = {
-            value: (bool(self.made_by(value, ATOM, FEWEST)), -int(self.at(value).sum())) for value in values
-        }
+        common = (self.distinct[often] + 0.0).tolist()  # no minus 0
+        values = [value for value in common if not same(ends, value).any()]
+        key = {one: (bool(self.made_by(one, ATOM, FEWEST)), -int(self.at(one).sum())) for one in values}
         return min(values, key=key.__getitem__, default=None)
 
 
@@ -257,9 +242,8 @@ def control_dimensions(controls: Mapping[str, np.ndarray]) -> tuple[ControlDimen
         return ()
     integer = all(steps.dtype.kind in "iu" for steps in controls.values())
     starts = np.cumsum([0, *(len(controls[name]) for name in names)])
-    rows = np.concatenate([controls[name].reshape(len(controls[name]), -1) for name in names]).astype(
-        np.float64
-    )
+    flat = [controls[name].reshape(len(controls[name]), -1) for name in names]
+    rows = np.concatenate(flat).astype(np.float64)
     dimensions: dict[int, ControlDimension] = {}
     rests: dict[int, np.ndarray] = {}
     for index, values in enumerate(rows.T):
@@ -302,19 +286,14 @@ def most_few(number: int) -> int:
 
 def all_constant(dimensions: Sequence[ControlDimension]) -> str:
     """The problem with controls that never vary, in words."""
-    values = ", ".join(number(dimension.minimum) for dimension in dimensions[:5]) + ", ..." * (
-        len(dimensions) > 5
-    )
-    return f"actions: every dimension is constant ({values}) in all demonstrations, so there is no control to model"
+    values = ", ".join([number(dim.minimum) for dim in dimensions[:5]] + ["..."] * (len(dimensions) > 5))
+    constant = f"every dimension is constant ({values}) in all demonstrations"
+    return f"actions: {constant}, so there is no control to model"
 
 
 def notes(dimensions: Iterable[ControlDimension]) -> list[str]:
     """A line for each unusual dimension."""
-    return [
-        f"control dimension {dimension.number}: {dimension.note}"
-        for dimension in dimensions
-        if dimension.note
-    ]
+    return [f"control dimension {dim.number}: {dim.note}" for dim in dimensions if dim.note]
 
 
 # --- kinds of distribution ----------------------------------------------------------------------------------
@@ -369,9 +348,7 @@ class ControlPart:
 
 def described(parts: Sequence[ControlPart]) -> list[str]:
     """A line for each part: dimensions, kind, and reason."""
-    return [
-        f"control {listed(part.dims)}: {part.kind}" + (f" ({part.why})" if part.why else "") for part in parts
-    ]
+    return [f"control {listed(one.dims)}: {one.kind}" + (f" ({one.why})" if one.why else "") for one in parts]
 
 
 def listed(dims: Sequence[int]) -> str:
@@ -387,8 +364,7 @@ def listed(dims: Sequence[int]) -> str:
 
 
 def measure(parts: Sequence[ControlPart]) -> dict[str, list[Any]]:
-    """The reference measure of a log-likelihood by dimension. Log-likelihoods compare only under equal
-    measures.
+    """The reference measure of a log-likelihood by dimension. Log-likelihoods compare only under equal ones.
 
     Each entry is the kind, followed by the bounds of a ``clipped`` dimension (None for no bound) or the
     values of a discrete dimension. For ``hurdle``: bounds, exact value, and the dimensions of the part.
@@ -449,32 +425,25 @@ def refuse_unknown_dimensions(spec: ControlSpec, size: int) -> None:
     """
     for place, part in enumerate(spec.parts):
         if unknown := [dimension for dimension in part.dims if dimension >= size]:
-            raise SpecError(
-                f"control.parts.{place}.dims: there is no control dimension {unknown[0]}; the control has {size}, "
-                "counted from 0"
-            )
+            problem = f"there is no control dimension {unknown[0]}; the control has {size}, counted from 0"
+            raise SpecError(f"control.parts.{place}.dims: {problem}")
 
 
-def _parts(
-    declared: str, dimensions: Sequence[ControlDimension], place: str, name: str
-) -> Iterator[ControlPart]:
+def _parts(declared: str, dims: Sequence[ControlDimension], place: str, name: str) -> Iterator[ControlPart]:
     """One part for each kind among the dimensions.
 
     :param place: key path of the spec, for errors.
     :param name: of the part in the spec; empty for all other dimensions.
     """
-    decided = {dim.number: _kind(dim, declared, len(dimensions) == 1) for dim in dimensions}
+    decided = {dim.number: _kind(dim, declared, len(dims) == 1) for dim in dims}
     kinds = [kind for kind in KINDS if kind in {kind for kind, _ in decided.values()}]
     for kind in kinds:
-        alike = [dim for dim in dimensions if decided[dim.number][0] == kind]
+        alike = [dim for dim in dims if decided[dim.number][0] == kind]
         called = kind if not name else name if len(kinds) == 1 else f"{name} {kind}"
         groups = [[dim] for dim in alike] if kind == "categorical" else [alike]
         for own in _resting_together(alike, place) if kind == "hurdle" else groups:
-            bounds = (
-                [_ends(dim, kind, place, len(alike) == 1) for dim in own]
-                if kind in (*BOUNDED, *DISCRETE)
-                else []
-            )
+            ended = own if kind in (*BOUNDED, *DISCRETE) else ()
+            bounds = [_ends(dim, kind, place, len(alike) == 1) for dim in ended]
             yield ControlPart(
                 called if kind != "categorical" or len(groups) == 1 else f"{called} {own[0].number}",
                 tuple(dim.number for dim in own),
@@ -496,12 +465,8 @@ def _kind(dim: ControlDimension, declared: str, alone: bool) -> tuple[str, str]:
         return declared, f"{len(dim.distinct)} discrete actions"
     if declared != "auto":
         unbounded = dim.atom and declared not in ("hurdle", *DISCRETE)
-        warning = (
-            f"; {dim.atom}, and options gain by collecting these steps, without any skill"
-            if unbounded
-            else ""
-        )
-        return declared, f"as declared{warning}"
+        warning = f"; {dim.atom}, and options gain by collecting these steps, without any skill"
+        return declared, "as declared" + (warning if unbounded else "")
     kind, why = "gaussian", "varies freely"
     if dim.values:
         kind, why = "binary", dim.note
@@ -534,18 +499,13 @@ def _resting_together(dimensions: Sequence[ControlDimension], place: str) -> lis
 
 def _ends(dim: ControlDimension, kind: str, place: str, alone: bool) -> tuple[float, float]:
     """The bounds of a dimension, or its extreme values where it is discrete."""
+    what = f"{place}.kind: control dimension {dim.number}"
     if kind == "categorical" and not dim.distinct:
-        raise SpecError(
-            f"{place}.kind: control dimension {dim.number} takes more than {MOST_DISTINCT} values"
-        )
+        raise SpecError(f"{what} takes more than {MOST_DISTINCT} values")
     if kind == "categorical" and not alone and not all(value.is_integer() for value in dim.distinct):
-        raise SpecError(
-            f"{place}.kind: control dimension {dim.number} is not of whole numbers: no discrete action"
-        )
+        raise SpecError(f"{what} is not of whole numbers: no discrete action")
     if kind == "binary" and len(dim.values) != 2:
-        raise SpecError(
-            f"{place}.kind: control dimension {dim.number} takes more than two values; it is no switch"
-        )
+        raise SpecError(f"{what} takes more than two values; it is no switch")
     if kind in DISCRETE:
         return dim.minimum, dim.maximum
     often = {name: value for name, value, _ in dim.extremes}

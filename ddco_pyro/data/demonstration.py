@@ -39,7 +39,8 @@ DIMENSION_NAMES = "dimension_names"
 class Demonstration:
     """One demonstration of T steps, s_0 a_0 ... s_{T-1} a_{T-1}.
 
-    >>> demo = ddco_pyro.Demonstration("demo_0", {"place": np.zeros((10, 2))}, np.ones((10, 2)), {"phase": [0] * 10})
+    >>> observations, labels = {"place": np.zeros((10, 2))}, {"phase": [0] * 10}
+    >>> demo = ddco_pyro.Demonstration("demo_0", observations, np.ones((10, 2)), labels)
     >>> len(demo), demo.actions.dtype, demo.labels["phase"].shape
     (10, dtype('float64'), (10,))
 
@@ -61,14 +62,12 @@ class Demonstration:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name or "/" in self.name:
-            raise DemonstrationsError(
-                f"{self.name!r} cannot be the name of a demonstration; it must be a text, not empty, without a /"
-            )
+            wanted = "it must be a text, not empty, without a /"
+            raise DemonstrationsError(f"{self.name!r} cannot be the name of a demonstration; {wanted}")
         for what, arrays in (("observations", self.observations), ("labels", self.labels)):
             if not isinstance(arrays, Mapping) or not all(isinstance(key, str) for key in arrays):
-                raise DemonstrationsError(
-                    f"{self.name}: {what} have to be a mapping of names to arrays [T, ...]"
-                )
+                wanted = "a mapping of names to arrays [T, ...]"
+                raise DemonstrationsError(f"{self.name}: {what} have to be {wanted}")
         given = Demonstration.stored(**vars(self))
         check(given)
         vars(self).update(
@@ -87,8 +86,7 @@ class Demonstration:
         labels: Mapping[str, Any] = NOTHING,
         attributes: Mapping[str, Attribute] = NOTHING,
     ) -> Demonstration:
-        """A demonstration as its source stores it: of any types, observations lazy or not, and not yet
-        checked.
+        """A demonstration as its source stores it: of any types, observations lazy or not, not yet checked.
 
         Pictures get their channels last, whole numbers as controls [T] become [T, 1], and labels [T, 1]
         become [T]. ``Demonstration(**vars(stored))`` is the same, checked and ready for a fit.
@@ -100,19 +98,17 @@ class Demonstration:
             try:
                 return values if isinstance(values, LazyArray) else turned(np.asarray(values))
             except (ValueError, TypeError, RuntimeError) as error:
-                raise DemonstrationsError(
-                    f"{name}: {place} is no array: {' '.join(str(error).split())}"
-                ) from None
+                text = " ".join(str(error).split())
+                raise DemonstrationsError(f"{name}: {place} is no array: {text}") from None
 
         demo, control = object.__new__(cls), array("actions", actions)
         known = {key: array(f"labels/{key}", values) for key, values in labels.items()}
+        flat = {key: each[:, 0] if each.shape[1:] == (1,) else each for key, each in known.items()}
         vars(demo).update(
             name=name,
             observations={key: array(f"obs/{key}", values) for key, values in observations.items()},
             actions=control[:, None] if control.dtype.kind in "iu" and control.ndim == 1 else control,
-            labels={
-                key: values[:, 0] if values.shape[1:] == (1,) else values for key, values in known.items()
-            },
+            labels=flat,
             attributes=attributes,
         )
         return demo
@@ -120,11 +116,8 @@ class Demonstration:
     def arrays(self) -> dict[str, Observed]:
         """Every array by its place: ``actions``, ``obs/<key>``, ``labels/<name>``."""
         seen = {f"obs/{key}": array for key, array in self.observations.items()}
-        return {
-            "actions": self.actions,
-            **seen,
-            **{f"labels/{key}": array for key, array in self.labels.items()},
-        }
+        known = {f"labels/{key}": array for key, array in self.labels.items()}
+        return {"actions": self.actions, **seen, **known}
 
     def controls(self, relative_to: str | None = None) -> np.ndarray:
         """The controls [T, A]; minus the observation of this key, where there is one.
@@ -150,9 +143,8 @@ class Demonstration:
     @property
     def shapes(self) -> str:
         """The arrays, a line each."""
-        return "".join(
-            f"\n  {place} {[*array.shape[1:]]} {array.dtype}" for place, array in self.arrays().items()
-        )
+        each = self.arrays().items()
+        return "".join(f"\n  {place} {[*array.shape[1:]]} {array.dtype}" for place, array in each)
 
 
 def _ready(array: Observed) -> Observed:
@@ -179,7 +171,7 @@ def check(demo: Demonstration, first: Demonstration | None = None) -> None:
 
 
 def _problems(demo: Demonstration, other: Demonstration) -> Iterator[str]:
-    """The problems with a demonstration beside another one; only where there is none does the next one make sense."""
+    """The problems with a demonstration beside another one; each makes sense only if none comes before it."""
     ours, theirs = demo.arrays(), other.arrays()
     for place, array in ours.items():
         if array.dtype.kind not in NUMBERS:
@@ -203,31 +195,29 @@ def problem_of(place: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
     if place.startswith("obs/"):
         return network_input(shape, dtype)[1]
     if place.startswith("labels/"):
+        if dtype.kind in "iub" and not shape:
+            return ""
         had = "text" if dtype.kind in "OSU" else str(dtype)
-        stored = f"is {had} of shape [{', '.join(map(str, ('steps', *shape)))}]"
-        return (
-            "" if dtype.kind in "iub" and not shape else f"{stored}, it has to be integers of shape [steps]"
-        )
+        size = ", ".join(map(str, ("steps", *shape)))
+        return f"is {had} of shape [{size}], it has to be integers of shape [steps]"
     if dtype.kind not in NUMBERS:
         return no_numbers(dtype)
     if shape:
-        return (
-            ""
-            if len(shape) == 1 and shape[0]
-            else f"has shape {list(shape)} at each step, it has to be [dimensions]"
-        )
+        wrong = f"has shape {list(shape)} at each step, it has to be [dimensions]"
+        return "" if len(shape) == 1 and shape[0] else wrong
     return (
-        f"is {dtype} of shape [steps]; store discrete actions as integers (astype(int)), and anything else as "
-        "[steps, 1] (actions[:, None])"
+        f"is {dtype} of shape [steps]; store discrete actions as integers (astype(int)), and anything else "
+        "as [steps, 1] (actions[:, None])"
     )
 
 
 def different(array: Observed, steps: int, shape: tuple[int, ...], first: str) -> str:
-    """How an array differs from the controls in steps, or from the first demonstration in shape; empty if neither."""
+    """How an array differs from the controls in steps, or the first demonstration in shape; else empty."""
     if array.shape[:1] != (steps,):
         return f"has {array.shape[0] if array.shape else 'no'} steps, but actions has {steps}"
     if array.shape[1:] != shape:
-        return f"has shape {array.shape[1:]} at each step, but {shape} in {first}; all demonstrations need the same"
+        has = f"has shape {array.shape[1:]} at each step, but {shape} in {first}"
+        return f"{has}; all demonstrations need the same"
     return ""
 
 
@@ -246,9 +236,8 @@ def check_values(demo: Demonstration, remedy: str = "repair it", pictures: bool 
                 step, *index = np.argwhere(~good)[0].tolist()
                 value = block[step, *index]
                 limit = f", and at most {LARGEST:g} can be used" if np.isfinite(value) else ""
-                raise DemonstrationsError(
-                    f"{demo.name}: {place} is {number(value)} at step {before + step}, index {index}{limit}; {remedy}"
-                )
+                at = f"at step {before + step}, index {index}"
+                raise DemonstrationsError(f"{demo.name}: {place} is {number(value)} {at}{limit}; {remedy}")
             before += len(block)
 
 
@@ -262,17 +251,14 @@ def check_fitted(demo: Demonstration, shapes: Mapping[str, tuple[int, ...]], con
     known = demo.observations
     for key in shapes:
         if key not in known:
-            raise DemonstrationsError(
-                f"{demo.name}: there is no observation {key!r}{nearest(key, known)}, which the run was fitted to; "
-                f"there is: {', '.join(known)}"
-            )
+            lacks = f"there is no observation {key!r}{nearest(key, known)}, which the run was fitted to"
+            raise DemonstrationsError(f"{demo.name}: {lacks}; there is: {', '.join(known)}")
     fitted: dict[str, tuple[Observed, tuple[int, ...]]] = {"actions": (demo.actions, (control_size,))}
     fitted |= {f"obs/{key}": (known[key], tuple(shape)) for key, shape in shapes.items()}
     for place, (array, expected) in fitted.items():
         if array.shape[1:] != expected:
-            raise DemonstrationsError(
-                f"{demo.name}: {place} has shape {array.shape[1:]} at each step, the run was fitted to {expected}"
-            )
+            has = f"{place} has shape {array.shape[1:]} at each step"
+            raise DemonstrationsError(f"{demo.name}: {has}, the run was fitted to {expected}")
         if why := network_input(array.shape[1:], array.dtype)[1]:
             raise DemonstrationsError(f"{demo.name}: {place} {why}")
 
@@ -295,8 +281,7 @@ COPIES = 4.0 + 16.0
 
 
 def needed(demos: Iterable[Demonstration], copies: float = COPIES) -> float:
-    """Bytes for demonstrations, by the shapes of their arrays: the arrays as read, and copies padded to the
-    longest.
+    """Bytes for demonstrations, by their arrays' shapes: arrays as read, and copies padded to the longest.
 
     Pictures that stay in their file count for nothing.
 

@@ -1,4 +1,4 @@
-"""Demonstrations ready for a fit: alike, in memory except for pictures in files; read, written and divided."""
+"""Demonstrations ready for a fit: alike, in memory except pictures in files; read, written and divided."""
 
 from __future__ import annotations
 
@@ -18,24 +18,15 @@ from ddco_pyro.data.hdf5 import natural
 from ddco_pyro.data.labels import LABEL_NAMES, label_names
 from ddco_pyro.data.sources import open_own
 from ddco_pyro.data.sources.robomimic import frequency_of, robomimic_file, write_demonstration
-from ddco_pyro.data.tasks import (
-    NAMES,
-    TASKS,
-    Known,
-    Where,
-    by_task,
-    by_value,
-    of_tasks,
-    task_of,
-    with_task,
-)
+from ddco_pyro.data.tasks import NAMES, TASKS, Known, Where, by_task, by_value, of_tasks, task_of, with_task
 from ddco_pyro.errors import check_whole, nearest, path_of
 
+Masks = Mapping[str, Sequence[str]]
 LEAST = 3
 """Fewest demonstrations for a fit: to train, to stop early, and to validate."""
 
 FEW = 8
-"""Of fewer demonstrations none is held out from the fit: a part to tune by and a part to validate leave too few."""
+"""Of fewer demonstrations none is held out from the fit: parts to tune by and to validate leave too few."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,8 +79,7 @@ class Demonstrations(Sequence[Demonstration]):
         :param labels: names of the ground-truth labels to read; likewise.
         :param exclude: names of demonstrations that are not read and are removed from masks.
         :param where: attributes and values, such as ``{"task": ["reach"]}``: others are not read either.
-        :raises DemonstrationsError: the file cannot be read, lacks something asked for, or does not fit into
-            memory.
+        :raises DemonstrationsError: the file is unreadable, lacks what is asked for, or exceeds memory.
         """
         whole = path_of(path, "demonstrations")
         with open_own(whole, where, exclude) as source:
@@ -170,17 +160,14 @@ class Demonstrations(Sequence[Demonstration]):
         """Training and validation demonstrations, at least one each.
 
         The split follows the masks ``train`` and ``valid``; one mask leaves the rest to the other. Without
-        these masks, ``valid_fraction`` of the demonstrations of each task are drawn with ``seed`` for
-        validation.
+        these masks, ``valid_fraction`` of each task's demonstrations are drawn with ``seed`` to validate.
 
-        :raises DemonstrationsError: one part is empty, the masks overlap, or the fraction is not from 0 to
-            below 1.
+        :raises DemonstrationsError: a part is empty, masks overlap, or the fraction is not from 0 to below 1.
         """
         check_whole("seed", seed)
         if not isinstance(valid_fraction, Real) or not 0 <= valid_fraction < 1:
-            raise DemonstrationsError(
-                f"valid_fraction={valid_fraction!r}: has to be a number from 0 to below 1"
-            )
+            wanted = "has to be a number from 0 to below 1"
+            raise DemonstrationsError(f"valid_fraction={valid_fraction!r}: {wanted}")
         masks = self.masks
         if not masks.keys() & {"train", "valid"}:
             masks = {"valid": drawn({demo.name: demo.attributes for demo in self}, valid_fraction, seed)}
@@ -196,10 +183,8 @@ def with_tasks(demos: Demonstrations, tasks: Sequence[str] = ()) -> Demonstratio
     """
     for name, task in zip(demos.names, demos.tasks, strict=True):
         if not (task or tasks):
-            wanted = " or ".join(NAMES)
-            raise DemonstrationsError(
-                f"observations: task: {name} names none; give it the attribute {wanted}"
-            )
+            wanted = f"give it the attribute {' or '.join(NAMES)}"
+            raise DemonstrationsError(f"observations: task: {name} names none; {wanted}")
     tasks = tasks or sorted({*demos.tasks}, key=natural)
     each = tuple(with_task(demo, tasks) for demo in demos)
     return replace(demos, demonstrations=each, attributes={**demos.attributes, TASKS: json.dumps(tasks)})
@@ -211,12 +196,10 @@ def with_labels_of_tasks(demos: Demonstrations) -> Demonstrations:
     each, names = of_tasks(demos.tasks, [demo.labels for demo in demos], known)
     if names == known:
         return demos
-    parts = tuple(
-        Demonstration.stored(**{**vars(demo), "labels": own}) for demo, own in zip(demos, each, strict=True)
-    )
-    return replace(
-        demos, demonstrations=parts, attributes={**demos.attributes, LABEL_NAMES: json.dumps(names)}
-    )
+    pairs = zip(demos, each, strict=True)
+    parts = tuple(Demonstration.stored(**{**vars(demo), "labels": own}) for demo, own in pairs)
+    attributes = {**demos.attributes, LABEL_NAMES: json.dumps(names)}
+    return replace(demos, demonstrations=parts, attributes=attributes)
 
 
 def not_demonstrations(given: object) -> DemonstrationsError:
@@ -230,9 +213,7 @@ def not_demonstrations(given: object) -> DemonstrationsError:
 # --- division -----------------------------------------------------------------------------------------------
 
 
-def split_by_masks(
-    names: Sequence[str], masks: Mapping[str, Sequence[str]]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def split_by_masks(names: Sequence[str], masks: Masks) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Training and validation demonstrations by the masks ``train`` and ``valid``.
 
     If one of the masks is missing, it has all other demonstrations.
@@ -244,19 +225,16 @@ def split_by_masks(
     valid = given.get("valid", tuple(name for name in names if name not in train))
     for purpose, members in (("train", train), ("validate", valid)):
         if not members:
-            raise DemonstrationsError(
-                f"no demonstration is left to {purpose} with; add some or change the masks"
-            )
+            none = f"no demonstration is left to {purpose} with"
+            raise DemonstrationsError(f"{none}; add some or change the masks")
     if both := {*train} & {*valid}:
-        raise DemonstrationsError(
-            f"{min(both, key=natural)} is in mask/train and in mask/valid; remove it from one"
-        )
+        first = min(both, key=natural)
+        raise DemonstrationsError(f"{first} is in mask/train and in mask/valid; remove it from one")
     return train, valid
 
 
 def with_values(attribute: str, known: Known, fraction: float, seed: int) -> dict[str, tuple[str, ...]]:
-    """Demonstrations to hold out by some values of an attribute, about a fraction of all: their names by
-    value.
+    """Demonstrations to hold out by some values of an attribute, about a fraction of all: names by value.
 
     :param known: the attributes of each demonstration by its name.
     :param seed: draws the order in which values are tried.
@@ -265,9 +243,8 @@ def with_values(attribute: str, known: Known, fraction: float, seed: int) -> dic
     members = {value: tuple(names) for value, names in by_value(attribute, known).items()}
     if len(members) == 1:
         (value,) = members
-        raise DemonstrationsError(
-            f"attribute {attribute!r} is {value} in all demonstrations; hold out by another one"
-        )
+        alike = f"attribute {attribute!r} is {value} in all demonstrations"
+        raise DemonstrationsError(f"{alike}; hold out by another one")
     values, wanted = sorted(members, key=natural), fraction * len(known)
     chosen, number = dict[str, tuple[str, ...]](), 0
     for place in np.random.default_rng(seed).permutation(len(values)):
@@ -293,21 +270,19 @@ def drawn(known: Known, fraction: float, seed: int) -> tuple[str, ...]:
     return tuple(name for name in known if name in held_out)
 
 
-def check_division(names: Sequence[str], masks: Mapping[str, Sequence[str]]) -> None:
+def check_division(names: Sequence[str], masks: Masks) -> None:
     """Refuse demonstrations that are too few for a fit, by the masks or for a random split.
 
-    :raises DemonstrationsError: they are too few, a mask names an unknown demonstration, or the masks
-        overlap.
+    :raises DemonstrationsError: they are too few, a mask names an unknown demonstration, or masks overlap.
     """
     for problem in problems_of_masks(masks, names):
         raise DemonstrationsError(problem)
     if masks.keys() & {"train", "valid"}:
         check_trained(split_by_masks(names, masks)[0])
     elif len(names) < LEAST:
-        raise DemonstrationsError(
-            f"holds {len(names)} demonstration{'s' * (len(names) != 1)} that can be read, and a fit needs {LEAST}: to "
-            "train, to stop early, and to validate; add some"
-        )
+        holds = f"holds {len(names)} demonstration{'s' * (len(names) != 1)} that can be read"
+        purposes = "to train, to stop early, and to validate"
+        raise DemonstrationsError(f"{holds}, and a fit needs {LEAST}: {purposes}; add some")
 
 
 def check_trained(train: Sequence[str]) -> None:
@@ -316,13 +291,11 @@ def check_trained(train: Sequence[str]) -> None:
     :raises DemonstrationsError: there is only one.
     """
     if len(train) < LEAST - 1:
-        raise DemonstrationsError(
-            f"{len(train)} demonstration is left to train with, and a fit needs {LEAST - 1}: to train and to stop "
-            "early; add some, or hold fewer out"
-        )
+        left = f"{len(train)} demonstration is left to train with, and a fit needs {LEAST - 1}"
+        raise DemonstrationsError(f"{left}: to train and to stop early; add some, or hold fewer out")
 
 
-def problems_of_masks(masks: Mapping[str, Sequence[str]], names: Sequence[str]) -> Iterator[str]:
+def problems_of_masks(masks: Masks, names: Sequence[str]) -> Iterator[str]:
     """A line for each mask that names an unknown demonstration."""
     for mask, members in masks.items():
         if missing := sorted(set(members) - set(names)):

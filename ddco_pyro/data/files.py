@@ -24,8 +24,8 @@ from ddco_pyro.errors import BadInput, Failed
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {
-    errno.EACCES, errno.EBUSY, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
-    errno.ENAMETOOLONG, errno.ELOOP,
+    errno.EACCES, errno.EBUSY, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR,
+    errno.ENOTEMPTY, errno.ENAMETOOLONG, errno.ELOOP,
 }  # fmt: skip
 
 
@@ -172,7 +172,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder that replaces ``path`` when the block ends without an error, as :func:`whole_file` does."""
+    """A temporary folder that replaces ``path`` when the block ends without error, like :func:`whole_file`."""
     with _whole(path) as temporary:
         temporary.mkdir()
         yield temporary
@@ -180,7 +180,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _whole(path: Path) -> Iterator[Path]:
-    """A temporary path for what is to replace ``path``; those that killed processes of this machine left go."""
+    """A temporary path for what is to replace ``path``; those that killed processes left here are removed."""
     with _explained(path):
         place = Path(os.path.realpath(path)) if path.is_symlink() else path
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -226,14 +226,11 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in _FULL:
-            raise Failed(
-                f"{path}: there is no room to write it; free some space, then do the same again"
-            ) from error
+            text = "there is no room to write it; free some space, then do the same again"
+            raise Failed(f"{path}: {text}") from error
         if error.errno in _FORBIDDEN:
-            text = os.strerror(error.errno)
-            raise BadInput(
-                f"{path}: cannot be written: {text}; choose another place or change this one"
-            ) from error
+            text = f"cannot be written: {os.strerror(error.errno)}"
+            raise BadInput(f"{path}: {text}; choose another place or change this one") from error
         raise
 
 
@@ -255,9 +252,8 @@ def only_one(folder: Path, wait: bool = False) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             os.close(handle)
-            raise Busy(
-                f"{folder}: another process is at work on it; wait for it, or choose another place"
-            ) from None
+            text = "another process is at work on it; wait for it, or choose another place"
+            raise Busy(f"{folder}: {text}") from None
         if folder.exists() and os.path.samestat(os.fstat(handle), folder.stat()):
             break
         os.close(handle)  # the last holder has removed the folder

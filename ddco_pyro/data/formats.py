@@ -1,4 +1,4 @@
-"""The formats of demonstrations that can be read; to add one, write its reader and a row of :data:`FORMATS`."""
+"""Formats of demonstrations that can be read; to add one, write its reader and a row of :data:`FORMATS`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ class Format(NamedTuple):
     """A format of demonstrations.
 
     :param reader: yields one open :class:`~ddco_pyro.data.sources.Source`, ``module:function`` in
-        :mod:`ddco_pyro.data.sources`. A module imports its own library, which need not be installed for other
-        formats.
+        :mod:`ddco_pyro.data.sources`. A module imports its own library, which other formats do not need.
     :param text: the path in words, such as ``the folder of a Minari dataset``.
     :param sign: a file or folder that tells a folder of this format.
     :param fits: whether a path has the format, if the sign alone does not tell; also given the names at the
@@ -63,24 +62,20 @@ FORMATS = {
         fits=lambda path, names: path.is_file(),
     ),
 }
-"""By name, in the order in which they are recognised; the reader of robomimic's files reports what is no HDF5 file."""
+"""By name, in the order in which they are recognised; robomimic's reader reports what is no HDF5 file."""
 
 
 LAYOUTS = {
     "is a zarr store, as diffusion policy writes them": ({"zarr.json"}, {".zgroup"}),
     "is a TensorFlow dataset (RLDS)": ({"dataset_info.json", "features.json"}, {".tfrecord"}),
-    "is a recording of ROS: read it with rosbags (pip install rosbags), at each step the last message of each": (
-        {".mcap"},
-        {".db3"},
-    ),
+    "is a recording of ROS: read it with rosbags (pip install rosbags), "
+    "at each step the last message of each": ({".mcap"}, {".db3"}),
     "has the layout of RoboMIND, with observations in puppet and controls in master": (
         {"master", "puppet"},
         {"trajectory.hdf5"},
     ),
-    "has the layout of AgiBot World, with observations in state and controls in action, such as joint/position": (
-        {"action", "state", "timestamp"},
-        {"proprio_stats.h5"},
-    ),
+    "has the layout of AgiBot World, with observations in state and controls in action, "
+    "such as joint/position": ({"action", "state", "timestamp"}, {"proprio_stats.h5"}),
     "has the layout of RoboSet, with an episode in each Trial": ({"Trial0"}, {"Trial1"}),
 }
 """Layouts that a few lines of Python convert, in words, and alternative sets of names that tell them: at the

@@ -1,4 +1,4 @@
-"""HDF5 files: lazy arrays, one-line errors about missing or damaged parts, and writing that survives a full disk."""
+"""HDF5: lazy arrays, one-line errors about missing or damaged parts, writing that survives a full disk."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
 
 
 class _Disk(io.FileIO):
-    """A file that stops writing at the first error and keeps it in ``error``: HDF5 may crash when a write fails."""
+    """A file that stops writing at the first error, kept in ``error``: HDF5 may crash when a write fails."""
 
     error: OSError | None = None
 
@@ -136,9 +136,8 @@ def datasets(group: h5py.Group, where: str = "", above: tuple[Any, ...] = ()) ->
         item = member(group, name, h5py.HLObject, where)
         if isinstance(item, h5py.Group):
             if item in (*above, group):
-                raise DemonstrationsError(
-                    f"{where}{name}: its groups go in a circle; write it again without that"
-                )
+                circle = "its groups go in a circle; write it again without that"
+                raise DemonstrationsError(f"{where}{name}: {circle}")
             names += [f"{name}/{below}" for below in datasets(item, f"{where}{name}/", (*above, group))]
         elif isinstance(item, h5py.Dataset):
             names.append(name)
@@ -156,19 +155,16 @@ def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
     if dataset.shape is None or dataset.ndim == 0:
         raise DemonstrationsError(f"{where} has no steps; it has to be an array")
     if dataset.is_virtual or dataset.external:
-        raise _elsewhere(
-            f"{where} is {'virtual' if dataset.is_virtual else 'stored in another file'}", dataset.file
-        )
+        place = "virtual" if dataset.is_virtual else "stored in another file"
+        raise _elsewhere(f"{where} is {place}", dataset.file)
     what, claimed, there = "bytes", dataset.nbytes, dataset.id.get_storage_size()
     if dataset.chunks:
         what, there = "chunks", dataset.id.get_num_chunks()
-        claimed = math.prod(
-            -(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True)
-        )
+        sides = zip(dataset.shape, dataset.chunks, strict=True)
+        claimed = math.prod(-(-size // chunk) for size, chunk in sides)
     if there < claimed:
-        raise DemonstrationsError(
-            f"{where} claims {claimed} {what}, but the file holds {there}; write it again"
-        )
+        holds = f"the file holds {there}; write it again"
+        raise DemonstrationsError(f"{where} claims {claimed} {what}, but {holds}")
     return dataset
 
 
@@ -197,9 +193,8 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
         try:
             item = item[part]
         except (KeyError, OSError, RuntimeError) as error:
-            raise DemonstrationsError(
-                f"{where}{key} cannot be opened ({error}); the file may be damaged"
-            ) from error
+            text = f"cannot be opened ({error}); the file may be damaged"
+            raise DemonstrationsError(f"{where}{key} {text}") from error
     if not isinstance(item, kind):
         raise DemonstrationsError(
             f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(item).__name__.lower()}"
@@ -208,7 +203,7 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
 
 
 def attributes_of(owner: h5py.HLObject) -> dict[str, Attribute]:
-    """The attributes that hold one number or text. Other attributes are not read, because they can claim any size."""
+    """The attributes that hold one number or text. Others are not read, because they can claim any size."""
     kinds = {name: owner.attrs.get_id(name) for name in owner.attrs}
     single = [
         name for name, kind in kinds.items()

@@ -31,8 +31,7 @@ from ddco_pyro.events import Counted, OnEvent, ignore
 class Choice:
     """The part of a source that is imported.
 
-    :param observations: keys, or names in the source; if empty, the observations that hold numbers, without
-        videos.
+    :param observations: keys, or names in the source; if empty, those that hold numbers, without videos.
     :param mask: import only the demonstrations of this mask (robomimic: filter key).
     :param videos: whether videos are decoded, too.
     :param image_size: height and width to which pictures are scaled; None for no scaling.
@@ -80,8 +79,7 @@ def import_demonstrations(
     choice: Choice = Choice(),
     on_event: OnEvent = ignore,
 ) -> Imported:
-    """Write the demonstrations of a file or folder, or of several that are pooled, into ``out``, whole or not
-    at all.
+    """Write the demonstrations of a file or folder, or of pooled ones, into ``out``, whole or not at all.
 
     Of several tasks, observations that only some have are left out unless they are chosen. Memory holds one
     demonstration at a time, of pictures a block.
@@ -125,10 +123,9 @@ def import_demonstrations(
             if not written:
                 why = next(iter(left_out.values()), "there is none")
                 raise DemonstrationsError(f"{paths[0]}: none of its demonstrations can be used: {why}")
-            kept = {
-                mask: tuple(name for name in members if name in data) for mask, members in whole.masks.items()
-            }
-            masks |= {mask: members for mask, members in kept.items() if members}
+            for mask, members in whole.masks.items():
+                if kept := tuple(name for name in members if name in data):
+                    masks[mask] = kept
         notes = [*_unread(whole.read(written[0]), chosen(written[0]).observations, alone), *notes]
     reasons = {name: str(error) for name, error in left_out.items()}
     return Imported(out, written, reasons, tuple(notes), {key: len(each) for key, each in labels.items()})
@@ -188,7 +185,7 @@ def _labelled(source: Source, labels: Mapping[str, Mapping[str, np.ndarray]], na
 
 
 def _unread(demo: Demonstration, chosen: Mapping[str, Observed], alone: Mapping[str, str]) -> Iterator[str]:
-    """A line for each observation that networks cannot read, and for each that is left out without being asked for."""
+    """A line for each observation that networks cannot read, and for each left out without being asked."""
     yield from (f"obs/{key} is left out: {why}" for key, why in alone.items() if key not in chosen)
     for key, array in demo.observations.items():
         if why := network_input(array.shape[1:], array.dtype)[1]:
@@ -239,9 +236,8 @@ def _frames(frequency: float | None, hz: float) -> int:
     frames = round(frequency / hz)
     if not frames or abs(frames * hz / frequency - 1) > NEARLY:
         rates = ", ".join(f"{frequency / number:g}" for number in range(2, 6))
-        raise BadInput(
-            f"--hz {hz:g}: the source has {frequency:g} Hz; give a whole part of that, such as {rates}"
-        )
+        has = f"the source has {frequency:g} Hz; give a whole part of that, such as {rates}"
+        raise BadInput(f"--hz {hz:g}: {has}")
     return frames
 
 
@@ -258,11 +254,9 @@ def _slower(array: Observed, frames: int) -> Observed:
 
         return replace(array, shape=(steps, *array.shape[1:]), read=read, file="")
     rows = np.asarray(array)[: steps * frames].reshape(steps, frames, *array.shape[1:])
-    return (
-        rows.mean(1, dtype=np.float64).astype(array.dtype)
-        if array.dtype.kind == "f"
-        else rows[:, frames // 2]
-    )
+    if array.dtype.kind == "f":
+        return rows.mean(1, dtype=np.float64).astype(array.dtype)
+    return rows[:, frames // 2]
 
 
 def _scaled(array: Observed, size: tuple[int, int]) -> Observed:

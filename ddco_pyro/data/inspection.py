@@ -50,7 +50,7 @@ from ddco_pyro.data.tasks import Where, are_several, by_task, task_of
 from ddco_pyro.spec import ControlSpec
 
 GAP = 3.0
-"""A clock among observations has a gap where a step is so many times as long as the median; computers are late."""
+"""An observed clock has a gap where a step is so many times as long as the median; computers are late."""
 
 SLOWEST = 0.2
 """Control steps per second, Hz, below which a period may be in milliseconds: dt of 5 and more."""
@@ -58,8 +58,7 @@ SLOWEST = 0.2
 
 @dataclass
 class Field:
-    """Statistics of one array over the demonstrations that have it: ``actions``, ``obs/<key>`` or
-    ``labels/<name>``.
+    """Statistics of an array over demonstrations that have it: ``actions``, ``obs/<key>``, ``labels/<name>``.
 
     :param shape: of one step.
     :param minimum: the smallest finite value of each flattened dimension, in the array's type; empty without
@@ -176,13 +175,9 @@ class Field:
             name: [float(value) if np.isfinite(value) else None for value in getattr(self, name)]
             for name in ("minimum", "maximum")
         }
-        shown: dict[str, Any] = {
-            "dtype": str(self.dtype),
-            "shape": [*self.shape],
-            "values": sorted(self.values),
-        }
+        shown: dict[str, Any] = {"dtype": str(self.dtype), "shape": [*self.shape]}
         of_tasks = {task: sorted(own) for task, own in self.of_tasks.items()}
-        shown |= {"demonstrations": self.demonstrations, "of_tasks": of_tasks}
+        shown |= {"values": sorted(self.values), "of_tasks": of_tasks, "demonstrations": self.demonstrations}
         return asdict(self) | ends | shown | {"constant": self.constant, "rounding": self.rounding}
 
 
@@ -193,8 +188,7 @@ class Inspection:
     :param lengths: number of steps of each demonstration by name.
     :param problems: a line for each problem that a fit refuses.
     :param frequency: control steps per second, Hz; None if unknown.
-    :param control: statistics of each control dimension, of the control minus ``relative_to`` where there is
-        one.
+    :param control: statistics of each dimension of the control, minus ``relative_to`` where there is one.
     :param coincidences: a line for each kind of suspicious equality.
     :param leaks: observations, ``obs/<key>``, that no policy should read, and why.
     :param relative_to: the observation of which the control is a target; None without one.
@@ -321,9 +315,7 @@ class _Inspector:
     def __init__(self, source: Source, found: Inspection) -> None:
         self.source, self.found = source, found
         self.problems = defaultdict[tuple[str, str], list[str]](list)  # messages by kind and subject
-        self.vectors: dict[
-            str, dict[str, np.ndarray]
-        ] = {}  # controls and narrow observations, by place and name
+        self.vectors = dict[str, dict[str, np.ndarray]]()  # controls, narrow observations, by place and name
         self.digests: dict[str, bytes] = {}
         self.traits: list[Traits] = []
 
@@ -334,9 +326,8 @@ class _Inspector:
             try:
                 places[name] = self._read(name)
             except DemonstrationsError as error:
-                self.problems["unreadable", re.sub(r"\d+", "", str(error).removeprefix(name))].append(
-                    str(error)
-                )
+                kind = re.sub(r"\d+", "", str(error).removeprefix(name))
+                self.problems["unreadable", kind].append(str(error))
                 found.unreadable.append(name)
         for name, there in places.items():
             for place in (place for place in fields if place not in there):
@@ -365,14 +356,11 @@ class _Inspector:
         varying = [dimension.number for dimension in found.control if not dimension.constant]
         beside = {}
         for array in found.observations:
-            known = {
-                name: rows for name, rows in self.vectors.get(array.place, {}).items() if name in controls
-            }
+            own = self.vectors.get(array.place, {})
+            known = {name: rows for name, rows in own.items() if name in controls}
             if known:
-                commands = [controls[name] for name in known]
-                beside[array.place] = Beside(
-                    array.place, [*known.values()], commands, varying, array.constant
-                )
+                seen, commands = [*known.values()], [controls[name] for name in known]
+                beside[array.place] = Beside(array.place, seen, commands, varying, array.constant)
             why = generated(array.place) or (beside[array.place].reason if known else "")
             found.leaks |= {array.place: why} if why else {}
         if not any(dimension.integer or len(dimension.values) == 2 for dimension in found.control):
@@ -393,7 +381,7 @@ class _Inspector:
         found.coincidences = tuple(lines)
 
     def _clocks(self) -> Iterator[str]:
-        """A line for a rate that may be a period in milliseconds, and for the first fault of each observed clock."""
+        """A line for a rate that may be a period in milliseconds, and for the first fault of each clock."""
         if (rate := self.found.frequency) and rate <= SLOWEST:
             said = f'if its dt is in milliseconds, write file.attrs["control_frequency"] = {1000 * rate:.4g}'
             yield f"a step lasts {1 / rate:.4g} s by the file: {said}"
@@ -402,42 +390,35 @@ class _Inspector:
                 faults = ((name, clock_fault(rows[:, 0].astype(float), GAP)) for name, rows in each.items())
                 yield from islice((f"{place} {fault}, in {name}" for name, fault in faults if fault), 1)
 
-    def _odd(
-        self, dimensions: Sequence[ControlDimension], controls: Mapping[str, np.ndarray]
-    ) -> dict[str, str]:
+    def _odd(self, dims: Sequence[ControlDimension], controls: Mapping[str, np.ndarray]) -> dict[str, str]:
         """Names of demonstrations to exclude, and why.
 
         Dead ones are, and the few without which a control dimension is a switch.
         """
-        if any(dimension.integer for dimension in dimensions):
+        if any(dim.integer for dim in dims):
             return {}
         long = {name: rows for name, rows in controls.items() if len(rows) >= FEWEST}
-        still = {
-            name: rows for name, rows in long.items() if same(rows.min(0).astype(float), rows.max(0)).all()
-        }
-        dead = [name for name, rows in still.items() if not rows.any()]
+        still = [name for name, rows in long.items() if same(rows.min(0).astype(float), rows.max(0)).all()]
+        dead = [name for name in still if not long[name].any()]
         others = [name for name in still if name not in dead]
         reasons = dict.fromkeys(dead, "all commands are 0") if 2 * len(dead) < len(self.found.lengths) else {}
         if len(others) <= most_few(len(self.found.lengths)):
             reasons |= dict.fromkeys(others, "all commands are the same")
-        for dimension in dimensions:
-            why = f"control dimension {dimension.number} has further values there, and is a switch elsewhere"
-            reasons = {**dict.fromkeys(() if dimension.values else dimension.exceptions, why), **reasons}
+        for dim in dims:
+            why = f"control dimension {dim.number} has further values there, and is a switch elsewhere"
+            reasons = {**dict.fromkeys(() if dim.values else dim.exceptions, why), **reasons}
         return reasons
 
     def _read(self, name: str) -> Collection[str]:
         """Read a demonstration, vectors whole and pictures in blocks; the places of its arrays."""
         demo = self.source.read(name)
-        arrays = {
-            place: np.asarray(array) if _vector(place, array) else array
-            for place, array in demo.arrays().items()
-        }
+        arrays = demo.arrays()
+        arrays |= {place: np.asarray(array) for place, array in arrays.items() if _vector(place, array)}
         self.found.lengths[name], self.found.attributes[name] = len(demo), demo.attributes
         task, digest, vectors = task_of(demo.attributes), hashlib.sha256(), dict[str, np.ndarray]()
         for place, array in arrays.items():
-            field = self.found.fields.get(place) or Field(
-                place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0)
-            )
+            new = Field(place, array.shape[1:], array.dtype, np.zeros(0), np.zeros(0))
+            field = self.found.fields.get(place, new)
             if problem := different(array, len(demo), field.shape, "the first"):
                 self.problems["shape", place].append(f"{name}: {place} {problem}")
                 continue
@@ -485,10 +466,8 @@ def _problems(found: Inspection) -> Iterator[str]:
             yield f"{array.place} {problem}"
         if array.first is not None:
             name, step = array.first
-            affected = len(array.affected)
-            yield (
-                f"{array.place} has {array.unusable}, the first in {name} at step {step}; "
-                f"{affected} of {array.demonstrations} demonstrations {'is' if affected == 1 else 'are'} affected"
-            )
+            affected, are = len(array.affected), "is" if len(array.affected) == 1 else "are"
+            has = f"{array.place} has {array.unusable}, the first in {name} at step {step}"
+            yield f"{has}; {affected} of {array.demonstrations} demonstrations {are} affected"
     if empty := [name for name, steps in found.lengths.items() if steps == 0]:
         yield f"{few(empty)}: no steps"

@@ -18,7 +18,7 @@ EXCLUDE = "exclude"
 """The mask of demonstrations that a person leaves out; ``init`` excludes them."""
 
 BOUNDARY, SOURCE = "_boundary", "_source"
-"""Ends of the names of labels beside those of a level: 1 where a segment begins, and who says what a step is."""
+"""Ends of names of labels beside those of a level: 1 where a segment begins, and who says what a step is."""
 
 SOURCES = ("open", "proposed", "accepted", "given")
 """Who says what a step is: none, as a person left it open; the model; a person who accepts that; a person."""
@@ -32,6 +32,5 @@ def label_names(attributes: Mapping[str, object]) -> dict[str, list[str]]:
     try:
         return TypeAdapter(dict[str, list[str]]).validate_json(str(attributes.get(LABEL_NAMES, "{}")))
     except ValidationError:
-        raise DemonstrationsError(
-            f'attribute {LABEL_NAMES!r}: is no JSON such as {{"phase": ["reach", "grasp"]}}; correct or remove it'
-        ) from None
+        wrong = 'is no JSON such as {"phase": ["reach", "grasp"]}; correct or remove it'
+        raise DemonstrationsError(f"attribute {LABEL_NAMES!r}: {wrong}") from None

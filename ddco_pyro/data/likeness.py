@@ -1,4 +1,4 @@
-"""What demonstrations have in common, and which are unlike the others of their file, or unlike those of a fit."""
+"""What demonstrations have in common, and which are unlike the others of their file, or those of a fit."""
 
 from __future__ import annotations
 
@@ -90,8 +90,7 @@ class Traits:
 class Usual:
     """What the demonstrations of a fit have in common.
 
-    :param statistics: by place, the lowest, the median and the highest of each of the sizes of a number [3,
-        4, D].
+    :param statistics: by place, the lowest, median and highest of each of the sizes of a number [3, 4, D].
     :param correlations: of each control dimension with observations and time [A, F].
     :param agreement: the cosine with these that nine in ten demonstrations exceed [A].
     :param steps: the median number of steps.
@@ -142,9 +141,8 @@ def traits_of(name: str, task: str, arrays: Mapping[str, np.ndarray]) -> Traits:
 
 def usual(known: Sequence[Traits], frequency: float | None) -> Usual:
     """What demonstrations have in common; ``frequency`` is their rate, Hz."""
-    extremes = {
-        place: np.quantile(each, (0, 0.5, 1), axis=0).tolist() for place, each in _sizes(known).items()
-    }
+    sizes = _sizes(known).items()
+    extremes = {place: np.quantile(each, (0, 0.5, 1), axis=0).tolist() for place, each in sizes}
     reference, agreement = _agreement(known)
     least = np.quantile(agreement, 0.1, axis=0).tolist()
     return Usual(extremes, reference.tolist(), least, _steps(known), frequency, unlike(known))
@@ -153,8 +151,7 @@ def usual(known: Sequence[Traits], frequency: float | None) -> Usual:
 def unlike(
     known: Sequence[Traits], usual: Usual | None = None, frequency: float | None = None
 ) -> dict[str, str]:
-    """Why demonstrations are unlike the others of their task, or unlike the usual ones of a fit, by their
-    names.
+    """Why demonstrations are unlike the others of their task, or the usual ones of a fit, by their names.
 
     :param frequency: control steps per second of these demonstrations, Hz.
     """
@@ -222,13 +219,11 @@ def _other_rate(
         if abs(math.log(frequency / usual.frequency)) > OTHER_RATE:
             yield f"{frequency:g} Hz, and {usual.frequency:g} Hz in the fit", names
         return
-    seen = {
-        place: np.median(sizes[:, 2], axis=0) for place, sizes in _sizes(known).items() if place != "actions"
-    }
+    seen = {place: sizes for place, sizes in _sizes(known).items() if place != "actions"}
+    changes = {place: np.median(sizes[:, 2], axis=0) for place, sizes in seen.items()}
     with np.errstate(all="ignore"):
-        ratios = np.concatenate(
-            [[1.0], *(own / usual.statistics[place][1][2] for place, own in seen.items())]
-        )
+        each = [own / usual.statistics[place][1][2] for place, own in changes.items()]
+    ratios = np.concatenate([[1.0], *each])
     faster = float(np.median(ratios[np.isfinite(ratios) & (ratios > 0)]))
     shorter = usual.steps / _steps(known)
     if max(faster, 1 / faster) >= FASTER and 1 / FASTER < faster / shorter < FASTER:
@@ -240,11 +235,9 @@ def _joined(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple[str,
     if not (places := [place for place in _shared(known) if place != "actions"]):
         return
     changes = np.stack([np.concatenate([one.sizes[place][3] for place in places]) for one in known])
-    usually = (
-        np.concatenate([usual.statistics[place][1][3] for place in places])
-        if usual
-        else np.median(changes, 0)
-    )
+    usually = np.median(changes, 0)
+    if usual:
+        usually = np.concatenate([usual.statistics[place][1][3] for place in places])
     found: dict[str, int] = {}
     for one, largest in zip(known, changes, strict=True):
         at = np.concatenate([one.jumps[place] for place in places])
@@ -253,10 +246,8 @@ def _joined(known: Sequence[Traits], usual: Usual | None) -> Iterator[tuple[str,
             found[one.name] = int(together.argmax()) + 1
     if found and (usual or 2 * len(found) <= len(known)):
         first, step = next(iter(found.items()))
-        yield (
-            f"observations jump at once, in {first} at step {step}: perhaps two recordings are joined",
-            [*found],
-        )
+        jump = f"observations jump at once, in {first} at step {step}"
+        yield f"{jump}: perhaps two recordings are joined", [*found]
 
 
 def _steps(known: Sequence[Traits]) -> float:
@@ -287,8 +278,7 @@ def _agreement(known: Sequence[Traits], usual: Usual | None = None) -> tuple[np.
 
 
 def _ratios(own: np.ndarray, usual: np.ndarray) -> np.ndarray:
-    """How many times its usual size a number has in each demonstration [N]; 0 where its units are the usual
-    ones.
+    """How many times its usual size a number has in each demonstration [N]; 0 where its units are usual.
 
     :param own: sizes, spans and mean changes [N, 3]; ``usual`` [n, 3].
     """
@@ -307,9 +297,8 @@ def _times(ratio: float, usual: Usual | None) -> str:
     units = " for ".join(FACTORS[factor] if ratio > 1 else FACTORS[factor][::-1])
     if not 1 / NEAR < size / factor < NEAR:
         factor, units = float(f"{size:.1g}"), "other units"
-    return (
-        f"about {factor:g} times as {'large' if ratio > 1 else 'small'} as {_where(usual)}, perhaps {units}"
-    )
+    as_large = f"{factor:g} times as {'large' if ratio > 1 else 'small'} as"
+    return f"about {as_large} {_where(usual)}, perhaps {units}"
 
 
 def _where(usual: Usual | None) -> str:
@@ -317,14 +306,14 @@ def _where(usual: Usual | None) -> str:
 
 
 def _larger_part(sizes: np.ndarray) -> np.ndarray:
-    """The rows [n, 3] on that side of the largest gap between sizes, their first column, on which most are."""
+    """The rows [n, 3] on that side of the largest gap between sizes, the first column, on which most are."""
     rows = sizes[sizes[:, 0].argsort()][np.count_nonzero(sizes[:, 0] == 0) :]
     cut = int(np.diff(np.log(rows[:, 0])).argmax()) + 1 if len(rows) > 1 else 0
     return max(rows[:cut], rows[cut:], key=len)
 
 
 def _turned(rows: np.ndarray, after: np.ndarray, changes: np.ndarray) -> np.ndarray:
-    """Whether numbers change by a turn of an angle, or to nearly their negative as those of a quaternion [T, D]."""
+    """Whether numbers change by a turn of an angle, or nearly to their negative, as a quaternion's [T, D]."""
     turned = np.abs(after + rows) < (1 - NEARLY) * changes
     for turn in TURNS.values():
         turned |= np.abs(changes - turn) < (1 - NEARLY) * turn
@@ -332,12 +321,11 @@ def _turned(rows: np.ndarray, after: np.ndarray, changes: np.ndarray) -> np.ndar
 
 
 def _correlations(controls: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Correlations over time [A, F] of controls [T, A] with values [T, F]; 0 where one of both is constant."""
+    """Correlations over time [A, F] of controls [T, A] with values [T, F]; 0 where one is constant."""
     left, right = (array - array.mean(0) for array in (controls, values))
     with np.errstate(all="ignore"):
-        return np.nan_to_num(
-            left.T @ right / np.outer(*(np.linalg.norm(array, axis=0) for array in (left, right)))
-        )
+        lengths = np.outer(*(np.linalg.norm(array, axis=0) for array in (left, right)))
+        return np.nan_to_num(left.T @ right / lengths)
 
 
 def _cosines(each: np.ndarray, reference: np.ndarray) -> np.ndarray:

@@ -37,9 +37,8 @@ class Transform(NamedTuple):
         if self == Transform():
             return tuple(stored)
         if len(stored) != PICTURE_DIMENSIONS:
-            raise TransformError(
-                f"has shape {list(stored)} at each step: crop and resize are for pictures [H, W, C]"
-            )
+            wanted = "crop and resize are for pictures [H, W, C]"
+            raise TransformError(f"has shape {list(stored)} at each step: {wanted}")
         height, width, colours = stored
         if self.crop is not None:
             top, left, *size = self.crop

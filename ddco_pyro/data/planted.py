@@ -57,10 +57,6 @@ def _episode(random: np.random.Generator) -> Iterator[tuple[dict[str, np.ndarray
         jaw = float(np.clip(jaw + 0.25 * command, 0, 1))
         thing = gripper if phase == 2 else thing
         rest -= int(phase == 3 and jaw == 1)
-        done = (
-            np.linalg.norm(gripper - thing) < NEAR,
-            jaw == 0,
-            np.linalg.norm(gripper - goal) < NEAR,
-            False,
-        )
+        at_thing, at_goal = (np.linalg.norm(gripper - place) < NEAR for place in (thing, goal))
+        done = (at_thing, jaw == 0, at_goal, False)
         phase += int(done[phase])

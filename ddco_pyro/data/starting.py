@@ -1,4 +1,4 @@
-"""The starting spec for a file of demonstrations: the template ``starting.yaml.j2``, filled from an inspection."""
+"""The starting spec for a file of demonstrations: ``starting.yaml.j2``, filled from an inspection."""
 
 from __future__ import annotations
 
@@ -105,15 +105,12 @@ def starting_spec(
     otherwise the affected observations are left out. Comments say why.
 
     :param hold_out_by: the attribute of demonstrations whose values are not to be on both sides of the split.
-    :raises DemonstrationsError: nothing can be fitted to the demonstrations, or the attribute cannot divide
-        them.
+    :raises DemonstrationsError: nothing can be fitted to them, or the attribute cannot divide them.
     """
     facts, reasons = _usable_part(inspection)
     observed, masks = facts.observations, [] if hold_out_by not in (None, EACH) else list(facts.masks)
-    vectors, images = (
-        [field for field in observed if field.image is image and not _left_out(facts, field)]
-        for image in (False, True)
-    )
+    used = [field for field in observed if not _left_out(facts, field)]
+    vectors, images = ([field for field in used if field.image is image] for image in (False, True))
     if not (vectors or images):
         why = next((f": {field.place} {_left_out(facts, field)}" for field in observed), "")
         look = command("inspect", facts.path)
@@ -188,7 +185,7 @@ def _usable_part(inspection: Inspection) -> tuple[Inspection, list[str]]:
 
 
 def _options(inspection: Inspection, labels: Field) -> tuple[int, str]:
-    """How many options labels ask for, and why, in words. Without names, a number is another label in each task."""
+    """How many options labels ask for, and why. Without names, a number is another label in each task."""
     if not inspection.several or labels.names:
         return len(labels.values), f"as many as the values of {labels.place}"
     return sum(map(len, labels.of_tasks.values())), f"as many as the values of {labels.place} in each task"
@@ -202,9 +199,7 @@ def _relative(vectors: Sequence[Field]) -> list[tuple[str, str]]:
     """Positions and that of the hand, to which they may be relative, by the ends ``_pos`` of their names."""
     positions = {field.key: field.shape for field in vectors if field.key.endswith(("_pos", "_position"))}
     hand = next((key for key in positions if HANDS.search(key)), "")
-    return [
-        (key, hand) for key, shape in positions.items() if hand and key != hand and shape == positions[hand]
-    ]
+    return [(key, hand) for key, shape in positions.items() if key != hand and shape == positions.get(hand)]
 
 
 def _held_out(inspection: Inspection, attribute: str) -> str:
@@ -216,14 +211,12 @@ def _held_out(inspection: Inspection, attribute: str) -> str:
         found = with_values(attribute, inspection.attributes, _valid_fraction(len(inspection.lengths)), 0)
     except DemonstrationsError as error:
         raise DemonstrationsError(f"{inspection.path}: {error}") from None
-    number = sum(map(len, found.values()))
-    return printable(
-        f"held out: {attribute} {', '.join(found)}, {number} of {len(inspection.lengths)} demonstrations"
-    )
+    number = f"{sum(map(len, found.values()))} of {len(inspection.lengths)} demonstrations"
+    return printable(f"held out: {attribute} {', '.join(found)}, {number}")
 
 
 def _fullest_first(labels: Sequence[Field]) -> list[Field]:
-    """Labels with the fewest unknown steps first, named ones of equals; constant ones, and ``segment``'s, are last."""
+    """Labels with the fewest unknown steps first, named ones of equals; constant and ``segment``'s last."""
     keys = {field.key for field in labels}
 
     def rank(field: Field) -> tuple[bool, bool, int, bool]:
@@ -240,7 +233,7 @@ def _text(value: str) -> str:
 
 
 def _seen(shape: Sequence[int]) -> tuple[list[int] | None, int]:
-    """Height and width to which pictures [H, W, C] are scaled, None for no scaling; the shift in training, pixels."""
+    """Height and width to which pictures [H, W, C] are scaled, or None; the shift in training, pixels."""
     scale = min(1.0, LONGEST / max(shape[:2]))
     size = [max(1, round(side * scale)) for side in shape[:2]]
     return size if scale < 1 else None, max(size) // SHIFT
@@ -258,17 +251,13 @@ def _valid_fraction(number: int) -> float:
 
 
 def _few_affected(inspection: Inspection) -> list[str]:
-    """The demonstrations to exclude so that no array has to be left out: those with unusable values, if they
-    are few.
+    """The demonstrations to exclude so that no array is left out: those with unusable values, if few.
 
     An array that is affected in many demonstrations, or absent in some, is left out in any case.
     """
     most = MOST_EXCLUDED * len(inspection.lengths)
-    keys = [
-        field
-        for field in (inspection.actions, *inspection.observations)
-        if field and inspection.everywhere(field)
-    ]
+    arrays = (inspection.actions, *inspection.observations)
+    keys = [field for field in arrays if field and inspection.everywhere(field)]
     names = {name for field in keys if len(field.affected) <= most for name in field.affected}
     fits = len(names) <= most and _divides(inspection, names)
     return [name for name in inspection.lengths if name in names] if fits else []
@@ -276,9 +265,8 @@ def _few_affected(inspection: Inspection) -> list[str]:
 
 def _divides(inspection: Inspection, without: Collection[str]) -> bool:
     """Whether enough demonstrations for a fit are left without these."""
-    masks = {
-        mask: [name for name in members if name not in without] for mask, members in inspection.masks.items()
-    }
+    given = inspection.masks.items()
+    masks = {mask: [name for name in members if name not in without] for mask, members in given}
     try:
         check_division([name for name in inspection.lengths if name not in without], masks)
     except DemonstrationsError:

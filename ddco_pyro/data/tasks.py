@@ -1,4 +1,4 @@
-"""The task of a demonstration by its attributes, demonstrations by value of an attribute, and a one-hot vector."""
+"""The task of a demonstration by its attributes, demonstrations by an attribute's value, a one-hot vector."""
 
 from __future__ import annotations
 
@@ -59,8 +59,7 @@ def by_value(attribute: str, known: Known) -> dict[str, list[str]]:
 def chosen(known: Known, where: Where) -> list[str]:
     """The names of the demonstrations with one of the values of each attribute.
 
-    :raises DemonstrationsError: an attribute or a value is unknown, or no demonstration has all that is asked
-        for.
+    :raises DemonstrationsError: an attribute or a value is unknown, or no demonstration has all of them.
     """
     names = list(known)
     for attribute, values in where.items():
@@ -85,8 +84,7 @@ def are_several(tasks: Sequence[str]) -> bool:
 def of_tasks(
     tasks: Sequence[str], labels: Sequence[Mapping[str, np.ndarray]], known: Mapping[str, Sequence[str]]
 ) -> tuple[list[dict[str, np.ndarray]], dict[str, list[str]]]:
-    """Labels [T] by name, numbered so that those of several tasks differ unless the file names them, and all
-    names.
+    """Labels [T] by name, numbered so that they differ between tasks unless the file names them; all names.
 
     >>> of_tasks(["push", "push", "reach", "reach"], [{"phase": np.array([0, 2])}] * 4, {})[1]
     {'phase': ['push: 0', 'push: 2', 'reach: 0', 'reach: 2']}
@@ -98,9 +96,8 @@ def of_tasks(
     every = dict.fromkeys(key for own in labels for key in own if not key.endswith((BOUNDARY, SOURCE)))
     for key in (key for key in every if key not in known and are_several(tasks)):
         having = [(task, own) for task, own in zip(tasks, numbered, strict=True) if key in own]
-        values = sorted(
-            {(task, value) for task, own in having for value in own[key].tolist() if value != UNKNOWN}
-        )
+        pairs = {(task, value) for task, own in having for value in own[key].tolist()}
+        values = sorted((task, value) for task, value in pairs if value != UNKNOWN)
         number = {value: place for place, value in enumerate(values)}
         for task, own in having:
             own[key] = np.array([number.get((task, value), UNKNOWN) for value in own[key].tolist()], int)
@@ -118,8 +115,7 @@ def known_tasks(attributes: Mapping[str, Attribute]) -> tuple[str, ...]:
 
 
 def one_hot(task: str, tasks: Sequence[str]) -> np.ndarray:
-    """1 for a task, 0 for the others of ``tasks`` [n]; of another task each is 1 / n, the mean of the known
-    ones.
+    """1 for a task, 0 for the others of ``tasks`` [n]; of another task each is 1 / n, the mean of known ones.
 
     >>> one_hot("push", ["push", "reach"]).tolist(), one_hot("open", ["push", "reach"]).tolist()
     ([1.0, 0.0], [0.5, 0.5])

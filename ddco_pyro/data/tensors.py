@@ -16,7 +16,7 @@ from ddco_pyro.data.files import Damaged, whole_file
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write tensors and text metadata with a checksum, whole or not at all; equal contents give equal bytes."""
+    """Write tensors and text metadata with a checksum, whole or not at all; equal contents: equal bytes."""
     checked = {**metadata, CHECKSUM: digest_of(tensors, metadata)}
     content = save({name: value.contiguous() for name, value in tensors.items()}, checked)
     with whole_file(path) as temporary:

@@ -25,8 +25,7 @@ class Source:
     """A file or folder of demonstrations, open for reading.
 
     :param names: of the demonstrations, in order.
-    :param read: a demonstration by its name, as it is stored; lazy arrays can be read while the source is
-        open.
+    :param read: a demonstration by its name, as stored; lazy arrays can be read while the source is open.
     :param masks: name of each mask (robomimic: filter key) to names of demonstrations.
     :param frequency: control steps per second, Hz; None if unknown.
     :param attributes: facts about the whole source.
@@ -53,8 +52,7 @@ def open_source(
     """Open a file or folder.
 
     :param form: its format, of :data:`~ddco_pyro.data.formats.FORMATS`; recognised if None.
-    :param actions: names of the arrays that are the control together, where a LeRobot or Minari dataset has
-        several.
+    :param actions: names of the arrays that are the control, where a LeRobot or Minari dataset has several.
     :param where: attributes and values of the demonstrations that the source has then; all if empty.
     :param exclude: names of demonstrations that the source has not.
     :raises DemonstrationsError: the source cannot be read, or has another format.
@@ -64,9 +62,8 @@ def open_source(
     refuse_unknown("format", form, FORMATS, DemonstrationsError, f"{path}: ")
     if actions and not FORMATS[form].parts:
         several = " or ".join(about.text for about in FORMATS.values() if about.parts)
-        raise DemonstrationsError(
-            f"{path}: has the format {form}, with one control; --action is for {several}"
-        )
+        has = f"has the format {form}, with one control"
+        raise DemonstrationsError(f"{path}: {has}; --action is for {several}")
     reader = contextmanager(resolve_name(f"{__name__}.{FORMATS[form].reader}"))
     with reader(path, actions) if FORMATS[form].parts else reader(path) as source:
         if not source.names:
@@ -86,10 +83,8 @@ def open_own(path: Path, where: Where, exclude: Sequence[str]) -> Iterator[Sourc
     with open_source(path, "robomimic") as source:
         for name in exclude:
             if name not in source.names:
-                known = nearest(name, source.names)
-                raise DemonstrationsError(
-                    f"demonstrations.exclude: there is no demonstration {name!r}{known}"
-                )
+                unknown = f"there is no demonstration {name!r}{nearest(name, source.names)}"
+                raise DemonstrationsError(f"demonstrations.exclude: {unknown}")
         if set(exclude) == set(source.names):
             raise DemonstrationsError("demonstrations.exclude: leaves every demonstration out; keep some")
         yield narrowed(source, where, exclude)
@@ -107,10 +102,8 @@ def narrowed(source: Source, where: Where, exclude: Sequence[str] = ()) -> Sourc
     if where:
         names = chosen({name: source.read(name).attributes for name in names}, where)
     left_out = {*source.names} - {*names}
-    masks = {
-        mask: tuple(name for name in members if name not in left_out)
-        for mask, members in source.masks.items()
-    }
+    given = source.masks.items()
+    masks = {mask: tuple(name for name in members if name not in left_out) for mask, members in given}
     return replace(source, names=tuple(names), masks=masks)
 
 
@@ -137,8 +130,8 @@ def format_of(path: Path) -> str:
     here = {*names, *suffixes, *(one.name for one in inside if one != path)}
     layout = next((text for text, signs in LAYOUTS.items() if any(each <= here for each in signs)), "")
     if form in ("", "robomimic") and layout:
-        lines = "write its episodes into an HDF5 file as data/demo_0, data/demo_1, ... with the lines in docs/own.md"
-        raise DemonstrationsError(f"{path}: {layout}; {lines}")
+        write = "write its episodes into an HDF5 file as data/demo_0, data/demo_1, ..."
+        raise DemonstrationsError(f"{path}: {layout}; {write} with the lines in docs/own.md")
     if form:
         return form
     folders = ", ".join(f"{about.text} (with {about.sign})" for about in FORMATS.values() if about.sign)
@@ -162,10 +155,8 @@ def _top_names(path: Path) -> frozenset[str]:
             names, data = frozenset(file), file.get("data")
             groups = data.values() if isinstance(data, h5py.Group) else ()
             first = next((group for group in groups if isinstance(group, h5py.Group)), ())
-            bare, prepared = (
-                "states" in first and "obs" not in first,
-                data is not None and "env_args" in data.attrs,
-            )
+            bare = "states" in first and "obs" not in first
+            prepared = data is not None and "env_args" in data.attrs
     except (OSError, RuntimeError, ValueError, KeyError):
         return frozenset()
     if bare:

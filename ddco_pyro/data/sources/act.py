@@ -21,8 +21,7 @@ EPISODE = re.compile(r"episode_(\d+)\.(?:hdf5|h5)")
 
 
 def open_act(path: Path) -> Iterator[Source]:
-    """Files ``episode_0.hdf5``, ... with ``action`` [T, A] and ``observations/<key>`` [T, ...], or one of
-    them.
+    """Files ``episode_0.hdf5``, ... with ``action`` [T, A] and ``observations/<key>`` [T, ...], or one.
 
     The ``base_action`` [T, B] of a mobile base is appended to the control. Pictures may be encoded, as bytes
     [T, longest].
@@ -66,16 +65,14 @@ def _observation(file: h5py.File, key: str, name: str) -> Observed:
     def decoded(encoded: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
         picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         if picture is None or picture.shape != (shape or picture.shape):
-            raise DemonstrationsError(
-                f"{where}: a picture cannot be decoded, or is of another size than the first"
-            )
+            wrong = "cannot be decoded, or is of another size than the first"
+            raise DemonstrationsError(f"{where}: a picture {wrong}")
         return picture
 
     shape = decoded(stored[0]).shape
 
     def read(start: int, stop: int) -> Iterator[np.ndarray]:
-        return in_blocks(
-            (decoded(each, shape) for block in stored.read(start, stop) for each in block), shape[:2]
-        )
+        encoded = (each for block in stored.read(start, stop) for each in block)
+        return in_blocks((decoded(each, shape) for each in encoded), shape[:2])
 
     return LazyArray((len(stored), *shape), PICTURES, read, where)

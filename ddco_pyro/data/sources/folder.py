@@ -41,9 +41,7 @@ def open_pooled(
     :raises DemonstrationsError: a file cannot be read, or two files have one name.
     """
     if len({path.stem for path in paths}) < len(paths):
-        twice = next(
-            path for number, path in enumerate(paths) if path.stem in [one.stem for one in paths[:number]]
-        )
+        twice = next(path for n, path in enumerate(paths) if path.stem in [one.stem for one in paths[:n]])
         raise DemonstrationsError(f"{twice}: another file is called {twice.stem}, too; rename one of both")
     with ExitStack() as stack:
         each = {path.stem: stack.enter_context(open_source(path, form, actions)) for path in paths}
@@ -79,9 +77,8 @@ def open_pooled(
             for key in words.keys() & demo.labels.keys():
                 for value, word in words[key].get(name, {}).items():
                     labels[key][demo.labels[key] == value] = called[key].index(word)
-            return Demonstration.stored(
-                name, demo.observations, demo.actions, labels, {**demo.attributes, TASK: task}
-            )
+            attributes = {**demo.attributes, TASK: task}
+            return Demonstration.stored(name, demo.observations, demo.actions, labels, attributes)
 
         masks: dict[str, tuple[str, ...]] = {}
         for stem, source in each.items():

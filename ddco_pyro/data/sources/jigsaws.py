@@ -1,5 +1,4 @@
-"""JIGSAWS, surgeons' demonstrations on a da Vinci robot (Gao and others 2014): text files in the official
-layout.
+"""JIGSAWS, surgeons' demonstrations on a da Vinci robot (Gao and others 2014), in its official text files.
 
 A task's folder has ``kinematics/AllGestures/NAME.txt``, one row of 76 numbers for each frame, 30 frames a
 second; ``transcriptions/NAME.txt``, rows ``FIRST LAST GESTURE`` whose frames count from 1, the last one
@@ -8,8 +7,7 @@ included; and ``meta_file_TASK.txt``, a row of a name, a self-stated skill and a
 A row has 19 numbers for each of four arms: position [3] in m, rotation matrix [9], velocity [3] in m/s,
 angular velocity [3] in rad/s, and the gripper's angle in rad. The order is master left, master right, and the
 instruments that the files' own documentation calls slave left and slave right. The left master drives the
-*last* instrument: each displacement of that one is half of the master's. Arms are named by the surgeon's hand
-here.
+*last* instrument: each displacement of that one is half of the master's. Here arms have the surgeon's hands.
 """
 
 from __future__ import annotations
@@ -45,14 +43,12 @@ def open_jigsaws(path: Path) -> Iterator[Source]:
     hand velocity [3], angular velocity [3] and gripper angle of the master. Observations are position [3],
     rotation [9] and gripper angle [1] of each instrument. The instruments' velocities are left out: they are
     the control itself. ``labels/gesture`` is the place of a frame's gesture among those of the task, -1 for a
-    frame without one. Attributes are the surgeon's letter, the trial's number, the self-stated skill and the
-    rating.
+    frame without one. Attributes are the surgeon's letter, the trial's number, the self-stated skill, rating.
 
     :raises DemonstrationsError: a transcription cannot be read; at reading a trial, its file cannot.
     """
-    trials = {
-        f"demo_{n}": trial for n, trial in enumerate(sorted((path / "kinematics/AllGestures").glob("*.txt")))
-    }
+    files = sorted((path / "kinematics/AllGestures").glob("*.txt"))
+    trials = {f"demo_{n}": trial for n, trial in enumerate(files)}
     transcriptions = [path / "transcriptions" / trial.name for trial in trials.values()]
     described = sorted(path.glob("meta_file_*.txt"))
     segments = {place.name: _segments(place) for place in transcriptions if place.is_file()}
@@ -64,11 +60,9 @@ def open_jigsaws(path: Path) -> Iterator[Source]:
     def read(name: str) -> Demonstration:
         trial = trials[name]
         arms = _arms(trial, name)
-        observations = {
-            f"{hand}_{key}": arms[:, place, part]
-            for hand, (_, place) in HANDS.items()
-            for key, part in PARTS.items()
-        }
+        observations = dict[str, np.ndarray]()
+        for hand, (_, place) in HANDS.items():
+            observations |= {f"{hand}_{key}": arms[:, place, part] for key, part in PARTS.items()}
         control = np.concatenate([arms[:, place, 12:] for place, _ in HANDS.values()], axis=1)
         gesture = np.full(len(arms), -1)
         for first, last, label in segments.get(trial.name, ()):
@@ -78,9 +72,8 @@ def open_jigsaws(path: Path) -> Iterator[Source]:
             facts |= {"surgeon": named["surgeon"], "trial": int(named["trial"])}
         if said := about.get(trial.stem):
             facts |= {"skill": said[0], "rating": float(said[1])}
-        return Demonstration.stored(
-            name, observations, control, {"gesture": gesture} if gestures else {}, facts
-        )
+        labels = {"gesture": gesture} if gestures else {}
+        return Demonstration.stored(name, observations, control, labels, facts)
 
     yield Source(tuple(trials), read, {}, 30.0, {LABEL_NAMES: json.dumps({"gesture": gestures})})
 
@@ -88,11 +81,8 @@ def open_jigsaws(path: Path) -> Iterator[Source]:
 def _arms(trial: Path, name: str) -> np.ndarray:
     """The numbers of each arm in each frame, [T, 4, 19]."""
     try:
-        rows = (
-            np.loadtxt(trial.read_text().splitlines(), ndmin=2)
-            if trial.stat().st_size
-            else np.empty((0, WIDTH))
-        )
+        lines = trial.read_text().splitlines()
+        rows = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, WIDTH))
     except ValueError as error:
         raise DemonstrationsError(f"{name}: {trial} is no table of numbers: {error}") from None
     if rows.shape[1] != WIDTH or not len(rows):

@@ -40,8 +40,8 @@ with needing("lerobot", "reading LeRobot datasets"):
 
 VERSION = "v3."
 _CONVERT = (
-    "convert it with LeRobot's own script: python -m lerobot.scripts.convert_dataset_v21_to_v30 (in LeRobot 0.4: "
-    "lerobot.datasets.v30.convert_dataset_v21_to_v30)"
+    "convert it with LeRobot's own script: python -m lerobot.scripts.convert_dataset_v21_to_v30 "
+    "(in LeRobot 0.4: lerobot.datasets.v30.convert_dataset_v21_to_v30)"
 )
 OBSERVATION, ACTION = "observation.", "action"
 SUBTASK, TASK = "subtask_index", "task_index"
@@ -115,10 +115,8 @@ class LeRobot:
         return Source(names, self._read, masks, self._frequency, about)
 
     def _check_actions(self) -> None:
-        types = {
-            name: about.get("dtype") if isinstance(about, dict) else None
-            for name, about in self.features.items()
-        }
+        features = self.features.items()
+        types = {name: about.get("dtype") if isinstance(about, dict) else None for name, about in features}
         there = [name for name, dtype in types.items() if not {name, str(dtype)} & _NO_CONTROL]
         for feature in self._actions:
             if feature not in there:
@@ -157,9 +155,8 @@ class LeRobot:
         with reading(path):
             columns = parquet.read_table(path).to_pydict()
             numbers = columns.pop(f"{kind}_index")
-            texts = next(
-                (texts for texts in columns.values() if all(isinstance(text, str) for text in texts)), ()
-            )
+            worded = (each for each in columns.values() if all(isinstance(text, str) for text in each))
+            texts = next(worded, ())
             names = {int(number): text for number, text in zip(numbers, texts, strict=True) if number >= 0}
             if max(names, default=0) >= MOST_NAMES:
                 raise ValueError(f"{kind}_index is {max(names)}")
@@ -168,9 +165,8 @@ class LeRobot:
     def _path(self, template: str, index: int, prefix: str, **more: str) -> Path:
         """A file of an episode, in the dataset's folder, by a template of ``meta/info.json``."""
         with reading(self.folder, f"demo_{index}: {template}"):
-            numbers = {
-                name: int(self._episodes[index][f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")
-            }
+            episode = self._episodes[index]
+            numbers = {name: int(episode[f"{prefix}/{name}"]) for name in ("chunk_index", "file_index")}
             path = filled(self.folder, str(self.info[template]), {**numbers, "episode_index": index, **more})
         return inside(self.folder, path)
 
@@ -183,35 +179,29 @@ class LeRobot:
         with reading(self.folder, name):
             rows = _Rows(path, index, name)
             self._check(rows, index)
-            observations = {
-                key: self._observation(rows, feature, index) for feature, key in self.keys.items()
-            }
+            seen = {key: self._observation(rows, feature, index) for feature, key in self.keys.items()}
             there = {name: column for name, column in self._labels.items() if column in rows.schema.names}
             labels = {name: np.asarray(rows.numbers(column, ())) for name, column in there.items()}
             if self._annotated:
                 labels["subtask"] = np.full(len(rows), -1)
                 for start, number in self._annotated.get(index, ()):
                     labels["subtask"][max(start, 0) :] = number
-            controls = {
-                key: np.asarray(rows.numbers(key, self.features[key]["shape"])) for key in self._actions
-            }
+            shapes = {key: self.features[key]["shape"] for key in self._actions}
+            controls = {key: np.asarray(rows.numbers(key, shape)) for key, shape in shapes.items()}
         tasks = self._episodes[index].get("tasks")
         about: dict[str, Attribute] = {"episode_index": index}
         if isinstance(tasks, Sequence) and len(tasks):
             about["task"] = "; ".join(map(str, tasks))
         noted = self._noted.get(index, {})
         about |= {key: noted[key] for key in ("flag", "note") if isinstance(noted.get(key), bool | str)}
-        return Demonstration.stored(
-            name, observations, joined(controls, f"{self.folder}: {name}"), labels, about
-        )
+        return Demonstration.stored(name, seen, joined(controls, f"{self.folder}: {name}"), labels, about)
 
     def _check(self, rows: _Rows, index: int) -> None:
         """Refuse an episode with a wrong number of rows, or with rows out of order."""
         length = self._episodes[index].get("length")
         if length not in (None, len(rows)):
-            raise DemonstrationsError(
-                f"{rows.name}: length in meta/episodes is {length}, and {rows.path} has {len(rows)} rows of it"
-            )
+            has = f"{rows.path} has {len(rows)} rows of it"
+            raise DemonstrationsError(f"{rows.name}: length in meta/episodes is {length}, and {has}")
         for column, frequency in (("frame_index", 1.0), ("timestamp", self._frequency)):
             if column in rows.schema.names and frequency:
                 times = np.asarray(rows.numbers(column, ())).astype(float)
@@ -219,10 +209,9 @@ class LeRobot:
                 wrong = ~(np.abs(times - expected) < 0.5 / frequency)
                 if wrong.any():
                     at = int(wrong.argmax())
-                    usual = f"is {times[at]:.6g} in row {at}, not {expected[at]:.6g}; correct it, or fps in meta/info.json"
-                    raise DemonstrationsError(
-                        f"{rows.path}: {rows.name}: {column} {clock_fault(times) or usual}"
-                    )
+                    other = f"is {times[at]:.6g} in row {at}, not {expected[at]:.6g}"
+                    fault = clock_fault(times) or f"{other}; correct it, or fps in meta/info.json"
+                    raise DemonstrationsError(f"{rows.path}: {rows.name}: {column} {fault}")
 
     def _observation(self, rows: _Rows, key: str, index: int) -> Observed:
         about = self.features[key]
@@ -243,9 +232,8 @@ class LeRobot:
             path = self._path("video_path", index, f"videos/{key}", video_key=key)
             begin = float(self._episodes[index][f"videos/{key}/from_timestamp"])
         rate = self._frequency or 1.0
-        yield from in_blocks(
-            frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size), size
-        )
+        seen = frames_of_steps(path, rows.name, begin + start / rate, stop - start, rate, size)
+        yield from in_blocks(seen, size)
 
 
 class _Rows:
@@ -264,9 +252,8 @@ class _Rows:
     def column(self, key: str) -> Any:
         """A column of the episode, in one piece."""
         if key not in self.schema.names:
-            raise DemonstrationsError(
-                f"{self.path}: {self.name}: has no column {key}, which meta/info.json names"
-            )
+            lacks = f"has no column {key}, which meta/info.json names"
+            raise DemonstrationsError(f"{self.path}: {self.name}: {lacks}")
         return parquet.read_table(self.path, columns=[key], filters=self.only).column(key).combine_chunks()
 
     def numbers(self, key: str, shape: Sequence[int]) -> LazyArray:
@@ -287,9 +274,8 @@ class _Rows:
             while pyarrow.types.is_nested(values.type):
                 row = np.repeat(row, compute.list_value_length(values).fill_null(0).to_numpy())
                 values = values.flatten()
-            counts = np.bincount(
-                row[values.is_valid().to_numpy(zero_copy_only=False)], minlength=stop - start
-            )
+            valid = values.is_valid().to_numpy(zero_copy_only=False)
+            counts = np.bincount(row[valid], minlength=stop - start)
             if (counts != size).any():
                 at = int((counts != size).argmax())
                 has = f"{key} has {counts[at]} numbers in row {start + at}, and meta/info.json says {size}"
@@ -318,11 +304,8 @@ def _episodes(folder: Path) -> dict[int, dict[str, Any]]:
     episodes: dict[int, dict[str, Any]] = {}
     for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         with reading(path):
-            names = parquet.read_schema(path).names
-            rows = parquet.read_table(
-                path, columns=[key for key in names if not key.startswith("stats/")]
-            ).to_pylist()
-            for row in rows:
+            columns = [key for key in parquet.read_schema(path).names if not key.startswith("stats/")]
+            for row in parquet.read_table(path, columns=columns).to_pylist():
                 index = int(row["episode_index"])
                 if index in episodes:
                     raise DemonstrationsError(f"{path}: demo_{index}: is there twice; remove one of the two")

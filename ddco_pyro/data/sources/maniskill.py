@@ -29,8 +29,8 @@ def open_maniskill(path: Path) -> Iterator[Source]:
         names = sorted((name for name in file if re.fullmatch(r"traj_\d+", name)), key=natural)
         if names and not any(_observed(member(file, name, h5py.Group, ""), name) for name in names):
             raise DemonstrationsError(
-                "has no observations; ManiSkill makes them: python -m mani_skill.trajectory.replay_trajectory "
-                f"--traj-path {quote(str(path))} --save-traj -o state"
+                "has no observations; ManiSkill makes them: python -m mani_skill.trajectory.replay_trajectory"
+                f" --traj-path {quote(str(path))} --save-traj -o state"
             )
 
         def read(name: str) -> Demonstration:

@@ -1,4 +1,4 @@
-"""Facts and names that sources give: rates, paths that stay in their folder, names that can be stored, counts."""
+"""Facts and names that sources give: rates, paths that stay in their folder, storable names, counts."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ _PERIODS = ("control_dt", "control_timestep", "dt")
 def rate(said: Mapping[str, object]) -> float | None:
     """Control steps per second, Hz, under one of the usual names; None where no usable number is under any.
 
-    Upper and lower case are the same. A number may be a text with the unit, such as ``20 Hz``. Periods are in
-    seconds.
+    Upper and lower case are the same. A number may be text with its unit, ``20 Hz``. Periods are in seconds.
     """
     known = {name.lower(): value for name, value in said.items()}
     for name in (*_RATES, *_PERIODS):
@@ -54,9 +53,8 @@ def clock_fault(times: np.ndarray, longest: float = LONGEST_GAP) -> str:
     if not len(wrong):
         return ""
     at = int(wrong[0])
-    fault = (
-        "has a gap before" if steps[at] > 0 else "steps back in" if steps[at] < 0 else "repeats its stamp in"
-    )
+    step = steps[at]
+    fault = "has a gap before" if step > 0 else "steps back in" if step < 0 else "repeats its stamp in"
     return f"{fault} row {at + 1}: {times[at]:.6g}, then {times[at + 1]:.6g}"
 
 
@@ -67,9 +65,8 @@ def inside(folder: Path, relative: str) -> Path:
     """
     pure = PurePosixPath(relative)
     if pure.is_absolute() or ".." in pure.parts or "\0" in relative:
-        raise DemonstrationsError(
-            f"{folder}: {relative[:100]!r} leads out of the dataset; correct its metadata"
-        )
+        leads = f"{relative[:100]!r} leads out of the dataset"
+        raise DemonstrationsError(f"{folder}: {leads}; correct its metadata")
     return folder / pure
 
 
@@ -94,8 +91,7 @@ def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
     """Arrays [T, ...] by name as one array [T, D], in this order.
 
     :param where: the demonstration, for messages.
-    :raises DemonstrationsError: there is no array, one holds no numbers, or has another number of steps than
-        the first.
+    :raises DemonstrationsError: there is no array, one holds no numbers, or not as many steps as the first.
     """
     if not parts:
         raise DemonstrationsError(f"{where}: has no actions")
@@ -107,16 +103,14 @@ def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
             )
         if len(array) != steps:
             raise DemonstrationsError(f"{where}: {name} has {len(array)} steps, but {first} has {steps}")
-    return np.concatenate(
-        [array.reshape(steps, math.prod(array.shape[1:])) for array in parts.values()], axis=1
-    )
+    flat = [array.reshape(steps, math.prod(array.shape[1:])) for array in parts.values()]
+    return np.concatenate(flat, axis=1)
 
 
 def stored_keys(folder: Path, names: Sequence[str], preferred: Sequence[str]) -> list[str]:
     """Keys under which HDF5 can store observations together.
 
-    Each name has its preferred key. Where another name has that key, or one above or below, the name itself
-    is the key.
+    Each name has its preferred key, or itself where another name has that key, or one above or below.
 
     :param preferred: of each name.
     :raises DemonstrationsError: a name cannot be stored, or occurs too often.
@@ -127,9 +121,8 @@ def stored_keys(folder: Path, names: Sequence[str], preferred: Sequence[str]) ->
             raise DemonstrationsError(f"{folder}: {called}, which cannot be stored; rename it")
     keys = [name if _meets(key, preferred) else key for name, key in zip(names, preferred, strict=True)]
     if any(_meets(key, keys) for key in keys):
-        raise DemonstrationsError(
-            f"{folder}: two observations have one name, or one lies in the other; rename one"
-        )
+        text = "two observations have one name, or one lies in the other; rename one"
+        raise DemonstrationsError(f"{folder}: {text}")
     return keys
 
 

@@ -26,11 +26,9 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     """Open a dataset's folder, its folder ``data``, or the file ``main_data.hdf5``.
 
     Nested observations ``{"arm": {"joints": ...}}`` become ``obs/arm/joints``. Nested actions are joined, in
-    the order of the action space. An episode of T steps has T + 1 observations; the one after the last action
-    is left out.
+    the order of the action space. Of the T + 1 observations of an episode of T steps the last is left out.
 
-    :param actions: names of nested actions that are the control together, such as ``arm/joints``; all if
-        empty.
+    :param actions: names of nested actions that are the control, such as ``arm/joints``; all if empty.
     :raises DemonstrationsError: Minari is not installed, or cannot read the dataset.
     """
     with needing("minari", "reading Minari datasets"):
@@ -39,9 +37,8 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
     with reading(folder):
         spaces = MinariStorage.read_raw_metadata(folder).keys() & {"observation_space", "action_space"}
         if len(spaces) < 2:  # Minari would make the environment, which runs code named by the data
-            raise DemonstrationsError(
-                f"{folder}: metadata.json does not say its observation and action spaces"
-            )
+            lacks = "metadata.json does not say its observation and action spaces"
+            raise DemonstrationsError(f"{folder}: {lacks}")
         storage = MinariStorage.read(folder)
     stored = _episodes(folder)
     if stored:
@@ -53,17 +50,14 @@ def open_minari(path: Path, actions: Sequence[str] = ()) -> Iterator[Source]:
             with opened(folder / MAIN) as file:
                 group = member(file, f"episode_{index}", h5py.Group, "")
                 for key in datasets(group):
-                    dataset_at(
-                        group, key, f"{name}: "
-                    )  # values that were never stored would be read as zeros
+                    dataset_at(group, key, f"{name}: ")  # values never stored would be read as zeros
         with reading(folder, name):
             (episode,) = storage.get_episodes([index])
             (facts,) = storage.get_episode_metadata([index])
         control = _control(folder, episode["actions"], actions, where)
         if (total := facts.get("total_steps")) not in (None, len(control)):
-            raise DemonstrationsError(
-                f"{where}: total_steps is {total}, and there are {len(control)} actions"
-            )
+            differ = f"total_steps is {total}, and there are {len(control)} actions"
+            raise DemonstrationsError(f"{where}: {differ}")
         seen = _flat(folder, episode["observations"], BARE)
         after = len(control) + 1  # with another number of steps it stays, and is refused later
         observations = {key: array[:-1] if len(array) == after else array for key, array in seen.items()}
@@ -90,7 +84,7 @@ def _flat(folder: Path, nested: Any, bare: str) -> dict[str, np.ndarray]:
 
 
 def _leaves(nested: Any, key: str, bare: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Path and array of each nested observation or action; ``bare`` is the path of an array that is not nested."""
+    """Path and array of each nested observation or action; ``bare`` is the path of an array not nested."""
     if isinstance(nested, Mapping | tuple):
         for name, below in nested.items() if isinstance(nested, Mapping) else enumerate(nested):
             yield from _leaves(below, f"{key}/{name}" if key else str(name), bare)

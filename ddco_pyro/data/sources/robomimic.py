@@ -44,14 +44,13 @@ SUBTASK = "subtask"
 """Labels that are made of signals, where the file has none of this name."""
 
 SIGNALS = ("datagen_info/subtask_term_signals", "obs/datagen_info/subtask_term_signals")
-"""Where MimicGen and Isaac Lab have a signal for each subtask: 1 from its last step on. What follows has none."""
+"""Where MimicGen and Isaac Lab have each subtask's signal: 1 from its last step on. What follows has none."""
 
 # --- reading ------------------------------------------------------------------------------------------------
 
 
 def open_robomimic(path: Path) -> Iterator[Source]:
-    """Open a file. Its source's ``read`` also takes the keys of observations and the names of labels; all if
-    None.
+    """Open a file. Its source's ``read`` also takes keys of observations and names of labels; all if None.
 
     :raises DemonstrationsError: the file cannot be read.
     """
@@ -79,8 +78,7 @@ def open_robomimic(path: Path) -> Iterator[Source]:
 
 
 def _ends(group: h5py.Group, name: str) -> dict[str, int]:
-    """The last step of each subtask by name, the first one first; of one that never ends, the number of
-    steps.
+    """The last step of each subtask by name, the first one first; the number of steps if it never ends.
 
     Empty without signals, and where the demonstration has labels of this name.
     """
@@ -88,15 +86,14 @@ def _ends(group: h5py.Group, name: str) -> dict[str, int]:
     if place is None or f"labels/{SUBTASK}" in group:
         return {}
     members, where = member(group, place, h5py.Group, f"{name}: "), f"{name}: {place}/"
-    signals = {
-        key: values_of(dataset_at(members, key, where), where + key) for key in datasets(members, where)
-    }
+    keys = datasets(members, where)
+    signals = {key: values_of(dataset_at(members, key, where), where + key) for key in keys}
     ends = {key: int(np.append(values.ravel() > 0, True).argmax()) for key, values in signals.items()}
     return dict(sorted(ends.items(), key=lambda item: item[1]))
 
 
 def _subtasks(ends: Mapping[str, int], order: Sequence[str], steps: int) -> np.ndarray:
-    """The subtask of each step [T]: the place in ``order`` of the one that ends next; behind them all the last one."""
+    """The subtask of each step [T]: the place in ``order`` of the one that ends next; behind all the last."""
     labels, before = np.full(steps, len(order), np.int16), 0
     for name, end in ends.items():
         if end < steps and name in order:
@@ -134,12 +131,9 @@ def _read(
         labels = ()
     labels = labels and [key for key in labels if key not in signalled]
     seen = {key: lazy(dataset, f"{name}: obs/{key}") for key, dataset in found("obs", observations).items()}
-    known = {
-        key: values_of(dataset, f"{name}: labels/{key}") for key, dataset in found("labels", labels).items()
-    }
-    return Demonstration.stored(
-        name, seen, values_of(control, f"{name}: actions"), known | signalled, attributes
-    )
+    labelled = found("labels", labels).items()
+    known = {key: values_of(dataset, f"{name}: labels/{key}") for key, dataset in labelled} | signalled
+    return Demonstration.stored(name, seen, values_of(control, f"{name}: actions"), known, attributes)
 
 
 def _mask(masks: h5py.Group, mask: str) -> tuple[str, ...]:
@@ -157,7 +151,7 @@ def _may_be_group(data: h5py.Group, name: str) -> bool:
 
 
 def frequency_of(attributes: Mapping[str, Attribute]) -> float | None:
-    """Control steps per second, Hz, by the file's attributes or robomimic's description of the environment in them."""
+    """Control steps per second, Hz, by the file's attributes or robomimic's environment, described in them."""
     try:
         said = json.loads(str(attributes.get(ENVIRONMENT, "{}")))
         return rate(attributes) or rate({**said, **(said.get("env_kwargs") or {})})
@@ -172,8 +166,7 @@ def frequency_of(attributes: Mapping[str, Attribute]) -> float | None:
 def robomimic_file(
     path: Path, attributes: Mapping[str, Attribute], masks: Mapping[str, Sequence[str]]
 ) -> Iterator[h5py.Group]:
-    """The group ``data`` of a new file, for :func:`write_demonstration`; the file is written whole or not at
-    all.
+    """The group ``data`` of a new file, for :func:`write_demonstration`; it is written whole or not at all.
 
     ``attributes`` and ``masks`` are read at the end of the block.
     """
@@ -184,9 +177,8 @@ def robomimic_file(
             (data if name == ENVIRONMENT else file).attrs[name] = value
         data.attrs[ALL_STEPS] = sum(len(group["actions"]) for group in data.values())
         for name, members in masks.items():
-            file.create_dataset(
-                f"mask/{name}", data=np.array([member.encode() for member in members], dtype=np.bytes_)
-            )
+            encoded = np.array([member.encode() for member in members], dtype=np.bytes_)
+            file.create_dataset(f"mask/{name}", data=encoded)
 
 
 def write_demonstration(data: h5py.Group, demo: Demonstration) -> None:
@@ -194,11 +186,9 @@ def write_demonstration(data: h5py.Group, demo: Demonstration) -> None:
     group = data.create_group(demo.name, track_order=True)
     group.attrs.update({**demo.attributes, STEPS: len(demo)})
     for place, array in demo.arrays().items():
+        how = {"chunks": (1, *array.shape[1:]), "compression": "gzip", "compression_opts": 1}
         packed = is_picture(array) and 0 not in array.shape
-        how = (
-            {"chunks": (1, *array.shape[1:]), "compression": "gzip", "compression_opts": 1} if packed else {}
-        )
-        dataset, at = group.create_dataset(place, array.shape, array.dtype, **how), 0
+        dataset, at = group.create_dataset(place, array.shape, array.dtype, **(how if packed else {})), 0
         for block in blocks(array):
             dataset[at : at + len(block)] = block
             at += len(block)

@@ -33,35 +33,32 @@ def frames(path: Path, start: float = 0.0) -> Iterator[tuple[float, np.ndarray]]
 def frames_of_steps(
     path: Path, name: str, start: float, steps: int, frequency: float, size: tuple[int, int]
 ) -> Iterator[np.ndarray]:
-    """The frames of a demonstration's consecutive steps, each within half a step of its time, uint8 [H, W,
-    3].
+    """Frames of a demonstration's consecutive steps, each within half a step of its time, uint8 [H, W, 3].
 
     :param name: of the demonstration, for messages.
     :param start: the time of the first one, in seconds.
     :param size: height and width.
     :raises DemonstrationsError: a frame is missing, or of another size, or the video cannot be decoded.
     """
+    where = f"{name}: {path}"
     if not path.is_file():
         raise DemonstrationsError(
-            f"{name}: {path}: the video is missing; leave its observation out with --observation"
+            f"{where}: the video is missing; leave its observation out with --observation"
         )
     seen = 0
     try:
         for time, frame in islice(frames(path, max(start - 0.5 / frequency, 0)), steps):
             if frame.shape[:2] != size:
                 actual, expected = (" x ".join(map(str, shape)) for shape in (frame.shape[:2], size))
-                raise DemonstrationsError(f"{name}: {path}: is {actual}, and meta/info.json says {expected}")
+                raise DemonstrationsError(f"{where}: is {actual}, and meta/info.json says {expected}")
             if abs(time - start - seen / frequency) > 0.5 / frequency:
-                raise DemonstrationsError(
-                    f"{name}: {path}: has no frame of step {seen}: the next one is at second {time:g}"
-                )
+                lacks = f"has no frame of step {seen}: the next one is at second {time:g}"
+                raise DemonstrationsError(f"{where}: {lacks}")
             seen += 1
             yield frame
     except (av.FFmpegError, IndexError) as error:
-        raise DemonstrationsError(
-            f"{name}: {path}: cannot be decoded: {' '.join(str(error).split())[:200]}"
-        ) from error
+        text = " ".join(str(error).split())[:200]
+        raise DemonstrationsError(f"{where}: cannot be decoded: {text}") from error
     if seen != steps:
-        raise DemonstrationsError(
-            f"{name}: {path}: has {seen} frames from second {start:g} on, and {steps} are needed"
-        )
+        has = f"has {seen} frames from second {start:g} on, and {steps} are needed"
+        raise DemonstrationsError(f"{where}: {has}")
