@@ -172,7 +172,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder that replaces ``path`` when the block ends without error, like :func:`whole_file`."""
+    """A temporary folder that replaces ``path`` when the block ends without error, as :func:`whole_file`."""
     with _whole(path) as temporary:
         temporary.mkdir()
         yield temporary

@@ -359,8 +359,8 @@ class _Inspector:
             own = self.vectors.get(array.place, {})
             known = {name: rows for name, rows in own.items() if name in controls}
             if known:
-                seen, commands = [*known.values()], [controls[name] for name in known]
-                beside[array.place] = Beside(array.place, seen, commands, varying, array.constant)
+                rows, commands = [*known.values()], [controls[name] for name in known]
+                beside[array.place] = Beside(array.place, rows, commands, varying, array.constant)
             why = generated(array.place) or (beside[array.place].reason if known else "")
             found.leaks |= {array.place: why} if why else {}
         if not any(dimension.integer or len(dimension.values) == 2 for dimension in found.control):

@@ -48,8 +48,7 @@ def export(fit: Fit, folder: str | Path, onnx: bool = False) -> Exported:
     export; otherwise nothing changes.
 
     :raises Failed: a form acts differently, or cannot be made.
-    :raises BadInput: ``folder`` holds other files, or numpy cannot evaluate the networks and no ONNX is asked
-        for.
+    :raises BadInput: ``folder`` holds other files, or numpy cannot evaluate networks and ONNX is not asked.
 
     >>> [*ddco_pyro.export(fit, "controller")]  # it acts like the original
     ['numpy']
@@ -89,9 +88,8 @@ def write_numpy(fit: Fit, folder: Path) -> bool:
 
 def runner_source() -> str:
     """The runner as a file that stands by itself: with the functions of all kinds of control."""
-    functions = dict.fromkeys(
-        chain.from_iterable((*emission.helpers, emission.control) for emission in KINDS.values())
-    )
+    used = ((*emission.helpers, emission.control) for emission in KINDS.values())
+    functions = dict.fromkeys(chain.from_iterable(used))
     names = ", ".join(f'"{kind}": {control.__name__}' for kind, control in CONTROLS.items())
     sources = [*(getsource(function) for function in functions), f"CONTROLS = {{{names}}}\n"]
     library = "from ddco_pyro.model.emissions import CONTROLS\n\n"
@@ -103,9 +101,8 @@ def _write_verified(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
     """Write every file into an empty folder, and replay recorded episodes with each form that can run."""
     forms = [*(["numpy"] if write_numpy(fit, folder) else []), *(["onnx"] if onnx else [])]
     if not forms:
-        raise BadInput(
-            f"{fit.place}: has networks that numpy cannot evaluate; export it with --out and --onnx"
-        )
+        has = "has networks that numpy cannot evaluate"
+        raise BadInput(f"{fit.place}: {has}; export it with --out and --onnx")
     if onnx:
         (folder / "controller.onnx").write_bytes(_onnx(StepProgram(fit.hierarchy.eval()).eval()))
     episodes = record(fit.controller(), fit.hierarchy)
@@ -115,14 +112,12 @@ def _write_verified(fit: Fit, folder: Path, onnx: bool = False) -> Exported:
     replayed = {}
     for form in forms:
         with _one_line_errors(f"as {form} it cannot be run"):
-            replayed[form] = runner.replay(
-                runner.Runner(folder, form), runner.read_arrays(folder / "check.npz")
-            )
+            controller = runner.Runner(folder, form)
+            replayed[form] = runner.replay(controller, runner.read_arrays(folder / "check.npz"))
         difference = replayed[form][0]
         if not difference < allowed:
-            cause = (
-                "the weights are so large that float32 is too coarse for them" if allowed == MOST else DEFECT
-            )
+            coarse = "the weights are so large that float32 is too coarse for them"
+            cause = coarse if allowed == MOST else DEFECT
             what = f"as {form} it differs from the run by {difference:.1e}, of {allowed:.1e} that are allowed"
             raise Failed(f"nothing was written: {what}; {cause}")
     return replayed
@@ -134,9 +129,8 @@ def _one_line_errors(what: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise Failed(
-            f"--onnx needs {error.name}; install it with: pip install 'ddco-pyro[export]'"
-        ) from error
+        install = "install it with: pip install 'ddco-pyro[export]'"
+        raise Failed(f"--onnx needs {error.name}; {install}") from error
     except Exception as error:
         text = " ".join(str(error).split())[:300]
         raise Failed(f"nothing was written: {what}: {type(error).__name__}: {text}") from error
@@ -147,12 +141,10 @@ def _onnx(program: StepProgram) -> bytes:
     inputs, (given, names) = program.example(), program.onnx_names()
     with _one_line_errors("the networks cannot be exported"), warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # of torch about itself
-        logging.getLogger("torch.onnx").setLevel(
-            logging.ERROR
-        )  # it misses torchvision, which nothing here needs
-        exported = torch.export.export(program, inputs)
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, not needed here
+        graph = torch.export.export(program, inputs)
         made = torch.onnx.export(
-            exported, inputs, input_names=given, output_names=names, dynamo=True, verbose=False
+            graph, inputs, input_names=given, output_names=names, dynamo=True, verbose=False
         )
         assert made is not None
         content: bytes = made.model_proto.SerializeToString()
@@ -200,7 +192,6 @@ def export_policy(fit: Fit, folder: Path) -> Exported:
         device = {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}
         steps = {"policy_preprocessor": [rename, batch, device], "policy_postprocessor": [device]}
         for name, processors in steps.items():
-            write_text(
-                temporary / f"{name}.json", json.dumps({"name": name, "steps": processors}, indent=2) + "\n"
-            )
+            text = json.dumps({"name": name, "steps": processors}, indent=2)
+            write_text(temporary / f"{name}.json", text + "\n")
     return exported

@@ -33,8 +33,7 @@ def named(outputs: Outputs) -> dict[str, Tensor]:
 
 
 class StepProgram(nn.Module):
-    """Maps features [F] (float64, not standardised), step [1], images [H, W, C] and the state to outputs and
-    state.
+    """Maps features [F] (float64, not standardised), step [1], images [H, W, C], state to outputs and state.
 
     ``names`` are those of :func:`named`. The state holds tensors [1, ...] of each recurrent network, in the
     order of :meth:`~ddco_pyro.model.hierarchy.Hierarchy.networks`.
@@ -55,9 +54,8 @@ class StepProgram(nn.Module):
         images, tensors = rest[: len(self.keys)], iter(rest[len(self.keys) :])
         states = {name: tuple(next(tensors) for _ in state) for name, state in self.state.items()}
         vectors = self.hierarchy.encoder.standardized(features.reshape(1, 1, -1))
-        pictures = {
-            key: image.reshape(1, 1, *image.shape) for key, image in zip(self.keys, images, strict=True)
-        }
+        pairs = zip(self.keys, images, strict=True)
+        pictures = {key: image.reshape(1, 1, *image.shape) for key, image in pairs}
         outputs, states = self.hierarchy.advance(Inputs(vectors, pictures, step), states)
         at_step = {name: values[0, 0] for name, values in named(outputs).items()}
         return at_step, [tensor for state in states.values() for tensor in state]
@@ -150,9 +148,9 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
     kind, first = KINDS[part.kind], sum(scaling.counts[:number])
     own = slice(first, first + scaling.counts[number])
     each = zip(callers, (*(level.count for level in hierarchy.option_levels()), 1), strict=True)
+    stds = [(caller.std, k) for caller, k in each]
     std = [
-        [] if one.std is None else one.std(torch.zeros(k, len(one.std.of_state)))[..., own].tolist()
-        for one, k in each
+        [] if one is None else one(torch.zeros(k, len(one.of_state)))[..., own].tolist() for one, k in stds
     ]
     given = next(caller.std for caller in callers if caller.std is not None)  # all have the same kinds of σ
     per_state = [
@@ -179,12 +177,10 @@ def _part(hierarchy: Hierarchy, number: int) -> dict[str, Any]:
 def _networks(hierarchy: Hierarchy) -> dict[str, Any] | None:
     """The scaling of features, and the form of each network; None where one has none."""
     levels = hierarchy.option_levels()
-    networks = {
-        f"caller_{number}": caller.network for number, caller in enumerate(hierarchy.named_callers().values())
-    }
-    networks |= {
-        f"end_{n}": level.termination for n, level in enumerate(levels) if level.termination is not None
-    }
+    callers = enumerate(hierarchy.named_callers().values())
+    networks = {f"caller_{n}": caller.network for n, caller in callers}
+    ends = enumerate(level.termination for level in levels)
+    networks |= {f"end_{n}": end for n, end in ends if end is not None}
     networks |= {} if hierarchy.trunk is None else {"trunk": hierarchy.trunk}
     forms = {name: network.numpy_form() for name, network in networks.items()}
     encoder = hierarchy.encoder
@@ -195,7 +191,7 @@ def _networks(hierarchy: Hierarchy) -> dict[str, Any] | None:
 
 
 def without_arrays(node: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
-    """A tree with the name of each array in its place; ``arrays`` gets them, named by their places below ``name``."""
+    """A tree with each array's name in its place; ``arrays`` gets them, named by places below ``name``."""
     if isinstance(node, np.ndarray):
         arrays[name] = node
         return {ARRAY: name}

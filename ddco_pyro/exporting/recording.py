@@ -1,4 +1,4 @@
-"""Synthetic episodes for checking exports: the original's actions in them, and the tolerance of the comparison."""
+"""Synthetic episodes to check exports: the original's actions in them, and the comparison's tolerance."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ MOST = 1e-4
 
 
 def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray]:
-    """Synthetic episodes: observations as large as the training data's, actions, options, and network
-    outputs.
+    """Synthetic episodes: observations as large as the training data's, actions, options, network outputs.
 
     ``seeds``, and for each episode ``observation_<episode>_<key>`` [T, ...], ``controls_<episode>`` [T, A],
     ``choices_<episode>`` [T, D], and the runner's outputs as ``<output>_<episode>`` [T, ...].
@@ -47,15 +46,12 @@ def record(controller: Controller, hierarchy: Hierarchy) -> dict[str, np.ndarray
         steps = STEPS if episode or hierarchy.encoder.images else max(STEPS, hierarchy.steps + 1)
         seen = _episode(hierarchy.encoder, steps, random)
         controller.reset(episode)
-        acted = [
-            (controller.act({key: obs[step] for key, obs in seen.items()}), controller.choices)
-            for step in range(steps)
-        ]
+        at_steps = ({key: obs[step] for key, obs in seen.items()} for step in range(steps))
+        acted = [(controller.act(observation), controller.choices) for observation in at_steps]
         arrays |= {f"observation_{episode}_{key}": obs for key, obs in seen.items()}
         arrays[f"controls_{episode}"] = np.stack([control for control, _ in acted])
-        arrays[f"choices_{episode}"] = np.array([choices for _, choices in acted], dtype=int).reshape(
-            steps, -1
-        )
+        choices = np.array([own for _, own in acted], dtype=int)
+        arrays[f"choices_{episode}"] = choices.reshape(steps, -1)
         outputs = _at_once(hierarchy, hierarchy.encoder.inputs([seen]))
         arrays |= {f"{name}_{episode}": values for name, values in outputs.items()}
     return arrays
@@ -79,9 +75,8 @@ def tolerance(hierarchy: Hierarchy, episodes: Mapping[str, np.ndarray]) -> float
             return runner.TOLERANCE
         recorded = {name: episodes[f"{name}_{number}"] for name in outputs}
         for rounded in (recorded, _stepwise(hierarchy, inputs)):
-            largest = max(
-                largest, *(runner.difference({}, name, rounded[name], outputs[name]) for name in outputs)
-            )
+            each = (runner.difference({}, name, rounded[name], outputs[name]) for name in outputs)
+            largest = max(largest, *each)
     return float(np.clip(ROUNDINGS * largest, runner.TOLERANCE, MOST))
 
 
@@ -108,8 +103,7 @@ def _arrays(outputs: Outputs) -> runner.Outputs:
 
 
 def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generator) -> dict[str, np.ndarray]:
-    """Random observations with the mean and spread of the training data, and of its differences where they
-    are used.
+    """Random observations with the mean and spread of training data, and of its differences if used.
 
     Angles are of a turn, and quaternions have norm 1.
     """
@@ -147,7 +141,7 @@ def _pictures(steps: int, shape: tuple[int, ...], random: np.random.Generator) -
 
 
 def _walk(start: np.ndarray, differences: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Values [T, F] that change by these differences [T, F], reflected at two standard deviations from the mean."""
+    """Values [T, F] that change by differences [T, F], reflected at two standard deviations from the mean."""
     values = [start]
     for difference in differences[1:]:
         ahead, back = values[-1] + difference, values[-1] - np.copysign(difference, values[-1] - mean)

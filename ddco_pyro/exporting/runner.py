@@ -68,9 +68,8 @@ class Runner:
         self.outputs: Outputs = {}
         self._last: dict[str, np.ndarray] | None = None
         self._marginal: np.ndarray | None = None
-        self._state = [
-            np.array(part["values"], part["kind"]).reshape(part["shape"]) for part in self.about["state"]
-        ]
+        state = self.about["state"]
+        self._state = [np.array(one["values"], one["kind"]).reshape(one["shape"]) for one in state]
 
     @property
     def active(self) -> dict[str, str]:
@@ -103,9 +102,7 @@ class Runner:
     def _psi(self, outputs: Outputs) -> tuple[float, ...]:
         """ψ of each active choice, lowest level first; 1 for control."""
         active = enumerate(self.choices)
-        return tuple(
-            float(outputs[f"termination_{level}"][choice - 1]) if choice else 1.0 for level, choice in active
-        )
+        return tuple(float(outputs[f"termination_{d}"][h - 1]) if h else 1.0 for d, h in active)
 
     def _features(self, now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -> np.ndarray:
         parts = [np.zeros(0)]
@@ -136,7 +133,7 @@ class Runner:
         return tuple(choices)
 
     def _largest_marginal(self, outputs: Outputs, _: np.random.Generator) -> tuple[int, ...]:
-        """The choices with the largest p(h_t | s_0, ..., s_t); ``_marginal`` has that of all, [C_D, ..., C_1]."""
+        """The choices of largest p(h_t | s_0, ..., s_t); ``_marginal`` has that of all, [C_D, ..., C_1]."""
         depth, kept = len(self.about["levels"]), []
         ended = np.ones(()) if self._marginal is None else self._marginal
         for level in range(depth if self._marginal is not None else 0):
@@ -159,18 +156,12 @@ class Runner:
         return int((total <= generator.random() * total[-1]).sum())
 
     def _control(self, outputs: Outputs, generator: np.random.Generator) -> np.ndarray:
-        """The most likely control, or a sample, of the lowest level with an option, else of the meta-policy."""
+        """The likeliest control, or a sample, of the lowest level with an option, else of the meta-policy."""
         level, actor = next(((d, h - 1) for d, h in enumerate(self.choices) if h > 0), (len(self.choices), 0))
         numbers, first = outputs[f"control_{level}"][actor].astype(np.float64), 0
-        sampled = self.about["control"] == "sample"
-        noise = (
-            generator.standard_normal(sum(len(part["places"]) for part in self.about["parts"]))
-            if sampled
-            else None
-        )
-        control = np.array(
-            self.about["constant"]
-        )  # dimensions that never varied in the demonstrations stay so
+        count = sum(len(part["places"]) for part in self.about["parts"])
+        noise = generator.standard_normal(count) if self.about["control"] == "sample" else None
+        control = np.array(self.about["constant"])  # dimensions that never varied stay so
         for part in self.about["parts"]:
             own, z = numbers[first : first + part["size"]], None if noise is None else noise[part["places"]]
             control[part["dims"]] = CONTROLS[part["kind"]](part, own, _std(part, level, actor, numbers), z)
@@ -198,11 +189,8 @@ def _turned(seen: Mapping[str, np.ndarray], spec: Mapping[str, Any]) -> np.ndarr
 
     Sines and cosines of angles, and products of quaternions, are behind the rest.
     """
-    value, angles, quaternions = (
-        seen[spec["key"]].astype(np.float64).ravel(),
-        spec["angles"],
-        spec["quaternions"],
-    )
+    value = seen[spec["key"]].astype(np.float64).ravel()
+    angles, quaternions = spec["angles"], spec["quaternions"]
     if spec["minus"]:
         value = value - seen[spec["minus"]].astype(np.float64).ravel()
     four = [value[first : first + 4] for first in quaternions]
@@ -237,9 +225,8 @@ def _checked(observation: Mapping[str, Any], spec: Mapping[str, Any]) -> np.ndar
     if data.shape != shape:
         raise ValueError(f"observation {key!r} has shape {data.shape}, the demonstrations had {shape}")
     if data.dtype.kind not in "fiub" or (spec["image"] and data.dtype != np.uint8):
-        raise ValueError(
-            f"observation {key!r} is {data.dtype}, it has to be {'uint8' if spec['image'] else 'numbers'}"
-        )
+        wanted = "uint8" if spec["image"] else "numbers"
+        raise ValueError(f"observation {key!r} is {data.dtype}, it has to be {wanted}")
     if not np.isfinite(data).all():
         raise ValueError(f"observation {key!r} is not finite")
     return data
@@ -252,9 +239,8 @@ def _read(folder: Path) -> dict[str, Any]:
     def placed(node: dict[str, Any]) -> Any:
         return weights[node[ARRAY]] if [*node] == [ARRAY] else node
 
-    about: dict[str, Any] = json.loads(
-        (folder / "controller.json").read_text(encoding="utf-8"), object_hook=placed
-    )
+    text = (folder / "controller.json").read_text(encoding="utf-8")
+    about: dict[str, Any] = json.loads(text, object_hook=placed)
     return about
 
 
@@ -265,7 +251,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 class NumpyNetworks:
-    """Every network of the hierarchy, as :class:`ddco_pyro.model.networks.perceptrons.NumpyForm` describes it."""
+    """Every network of the hierarchy, as a :class:`ddco_pyro.model.networks.perceptrons.NumpyForm` says."""
 
     def __init__(self, about: Mapping[str, Any]) -> None:
         self._about, self._networks = about, about["networks"]
@@ -309,7 +295,7 @@ class NumpyNetworks:
         return psi
 
     def _network(self, name: str) -> np.ndarray | None:
-        """The outputs of a network for each of K copies, [K, outputs]; None where there is no such network."""
+        """The outputs of a network for each of K copies, [K, outputs]; None if there is no such network."""
         node = self._networks.get(name)
         return None if node is None else self._evaluate(node)
 
@@ -369,9 +355,8 @@ def _convolved(maps: np.ndarray, layer: Mapping[str, Any]) -> np.ndarray:
     weight, bias = layer["weight"], layer["bias"]
     size, pad, stride = weight.shape[-1], (layer["padding"],) * 2, layer["stride"]
     padded = np.pad(maps, ((0, 0), (0, 0), pad, pad))
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))[
-        :, :, ::stride, ::stride
-    ]
+    every = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(2, 3))
+    windows = every[:, :, ::stride, ::stride]
     filters = weight.reshape(len(maps), -1, *weight.shape[1:])
     convolved = np.einsum("kchwij,kfcij->kfhw", windows, filters, optimize=True)
     return np.asarray(convolved + bias.reshape(len(maps), -1, 1, 1))
@@ -388,9 +373,8 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def _means(maps: np.ndarray) -> np.ndarray:
     """Means over 8 × 8 fields, [K, filters, 8, 8]."""
     rows, columns = (_fields(length, 8) for length in maps.shape[2:])
-    return np.stack(
-        [np.stack([maps[:, :, a:b, c:d].mean((2, 3)) for c, d in columns], -1) for a, b in rows], -2
-    )
+    means = [np.stack([maps[:, :, a:b, c:d].mean((2, 3)) for c, d in columns], -1) for a, b in rows]
+    return np.stack(means, -2)
 
 
 def _expected_places(maps: np.ndarray) -> np.ndarray:
@@ -428,16 +412,14 @@ def _numpy(_: Path, about: Mapping[str, Any]) -> Networks:
 
 
 def _onnx(folder: Path, about: Mapping[str, Any]) -> Networks:
-    """Every network of the hierarchy, from ``controller.onnx``, which gives first the outputs, then the next state."""
+    """Every network of the hierarchy, from ``controller.onnx``, which gives outputs, then the next state."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(str(folder / "controller.onnx"), options)
-    names, read = (
-        about["outputs"],
-        [argument.name for argument in session.get_inputs()],
-    )  # nothing reads the others
+    names = about["outputs"]
+    read = [argument.name for argument in session.get_inputs()]  # nothing reads the others
 
     def evaluate(
         features: np.ndarray, step: int, images: Mapping[str, np.ndarray], state: State
@@ -473,9 +455,8 @@ def replay(controller: Runner, episodes: Mapping[str, np.ndarray]) -> tuple[floa
             if list(controller.choices) != episodes[f"choices_{number}"][step].tolist():
                 largest = np.inf
             for name, value in {**controller.outputs, "controls": control}.items():
-                largest = max(
-                    largest, difference(controller.about, name, value, episodes[f"{name}_{number}"][step])
-                )
+                recorded = episodes[f"{name}_{number}"][step]
+                largest = max(largest, difference(controller.about, name, value, recorded))
     return largest, float(np.median(seconds))
 
 
@@ -486,7 +467,7 @@ def seen(episodes: Mapping[str, np.ndarray], number: int) -> dict[str, np.ndarra
 
 
 def difference(about: Mapping[str, Any], name: str, value: np.ndarray, original: np.ndarray) -> float:
-    """The largest difference of an output from the original's, in the units of :data:`TOLERANCE`; infinite for NaN."""
+    """The largest difference of an output from the original's, in units of :data:`TOLERANCE`; ∞ for NaN."""
     if name.startswith("selection"):
         value, original = np.exp(value), np.exp(original)
     unit = np.ones(original.shape)
@@ -507,9 +488,8 @@ def main() -> None:
     episodes = read_arrays(folder / "check.npz")
     largest, seconds = replay(Runner(folder, networks), episodes)
     allowed = float(episodes["tolerance"])
-    print(
-        f"largest difference: {largest:.1e} of {allowed:.1e} that are allowed; a step takes {1e3 * seconds:.3f} ms"
-    )
+    found = f"largest difference: {largest:.1e} of {allowed:.1e} that are allowed"
+    print(f"{found}; a step takes {1e3 * seconds:.3f} ms")
     sys.exit(0 if largest < allowed else 1)
 
 

@@ -118,7 +118,7 @@ class Background:
 
 
 def _telling(call: Call, file: Path) -> Any:
-    """The result of a call, which writes the share of its epochs or demonstrations that are done into a file."""
+    """The result of a call, which writes into a file which share of epochs or demonstrations are done."""
     epochs, done = 0, 0
 
     def tell(event: Event) -> None:

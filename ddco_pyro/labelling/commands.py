@@ -23,8 +23,7 @@ LONGEST = 80
 class Segment:
     """A segment that is shown: an option 0 to k from one step to before another.
 
-    :param source: who says so, one of :data:`~ddco_pyro.data.labels.SOURCES`; the option of an open segment
-        is 0.
+    :param source: who says so, one of :data:`~ddco_pyro.data.labels.SOURCES`; an open segment's option is 0.
     """
 
     start: int
@@ -76,11 +75,8 @@ class View:
             option = self._option(command, 1)
             before, old, after = names[: option - 1], names[option - 1], names[option:]
             new = self._text(command, (*before, *after))
-            return [
-                ("names", [*before, new, *after]),
-                ("colour", old, None),
-                ("colour", new, colours.get(old)),
-            ]
+            colour_changes = [("colour", old, None), ("colour", new, colours.get(old))]
+            return [("names", [*before, new, *after]), *colour_changes]
         if do == "drop":
             return self._drop(self._option(command, 1), self._option(command, 0, "into"))
         if do == "colour":
@@ -102,18 +98,17 @@ class View:
         if do == "paint":
             start, stop = (whole(command, key) for key in ("start", "stop"))
             if not 0 <= start < stop <= self.document.lengths[name]:
-                raise BadInput(
-                    f"paint: steps {start} to {stop} are not in {name}, which has {self.document.lengths[name]}"
-                )
+                has = self.document.lengths[name]
+                raise BadInput(f"paint: steps {start} to {stop} are not in {name}, which has {has}")
             return [(PAINT, name, start, stop, self._option(command, 0) or OPEN)]
         if do == "move":
             return self._move(name, whole(command, "boundary"), whole(command, "to"))
         step = whole(command, "step")
         here = self.at(name, step)
         if do in ("name", "open"):
-            reached = (
-                (step, self._said_until(name, step)) if command.get("from_here") else (here.start, here.stop)
-            )
+            reached = here.start, here.stop
+            if command.get("from_here"):
+                reached = step, self._said_until(name, step)
             return [(PAINT, name, *reached, OPEN if do == "open" else self._option(command, 1))]
         if do == "everywhere":
             option = self._option(command, 1)
@@ -132,9 +127,8 @@ class View:
             return [("cut", name, step, True)]
         if do == "merge":
             if here.stop == self.document.lengths[name]:
-                raise BadInput(
-                    f"merge: the segment at step {step} is the last of {name}; it has none to merge with"
-                )
+                last = f"the segment at step {step} is the last of {name}"
+                raise BadInput(f"merge: {last}; it has none to merge with")
             following = self.at(name, here.stop)
             if not here.option:
                 raise BadInput(f"merge: the segment at step {step} of {name} has no option; name it first")
@@ -190,14 +184,10 @@ class View:
             for option, start, stop in runs(options, np.diff(options, prepend=-1) != 0)
             if option
         ]
-        seen_options = np.where(
-            labels == OPEN, self.shown[name].options, np.where(labels == FREE, options, labels)
-        )
-        accepted = Shown(seen_options, np.ones(last))
-        return [
-            *confirmed,
-            ("accept", name, True, *first_wrong(self.first.get(name, self.shown[name]), accepted)),
-        ]
+        said = np.where(labels == FREE, options, labels)
+        accepted = Shown(np.where(labels == OPEN, self.shown[name].options, said), np.ones(last))
+        wrong = first_wrong(self.first.get(name, self.shown[name]), accepted)
+        return [*confirmed, ("accept", name, True, *wrong)]
 
     def _move(self, name: str, boundary: int, to: int) -> list[Change]:
         """A boundary elsewhere: the steps between, and one on either side, are said."""
@@ -207,9 +197,8 @@ class View:
             raise BadInput(f"move: no segment of {name} begins at step {boundary}")
         left, right = own[place - 1], own[place]
         if not left.start < to < right.stop:
-            raise BadInput(
-                f"move: step {to} is not within the segments at both sides of step {boundary} of {name}"
-            )
+            beside = f"the segments at both sides of step {boundary} of {name}"
+            raise BadInput(f"move: step {to} is not within {beside}")
         sides = [(segment, OPEN if segment.source == "open" else segment.option) for segment in (left, right)]
         low, high = min(boundary, to) - 1, max(boundary, to) + 1
         changes: list[Change] = [

@@ -1,8 +1,6 @@
-"""What a person has said of the options of one level, with undo and redo without end, and the file that keeps
-it.
+"""What a person has said of the options of one level, with undo and redo without end, and the file of that.
 
-A document knows no model, and the list of its edits is all of it. Each edit is on disk before it is
-acknowledged.
+A document knows no model, and the list of its edits is all of it. Edits are on disk before acknowledgement.
 """
 
 from __future__ import annotations
@@ -173,9 +171,8 @@ def replay(path: Path, content: bytes, document: Document, labels: str) -> tuple
         if lines:
             known = json.loads(lines[0])
             if known["labels"] != labels:
-                raise BadInput(
-                    f"{path}: has edits of other demonstrations or of another level; give another --out"
-                )
+                others = "has edits of other demonstrations or of another level"
+                raise BadInput(f"{path}: {others}; give another --out")
             document.names = tuple(known["names"])
         for line in lines[1:]:
             number += 1
@@ -238,8 +235,7 @@ class Journal:
     def write(self, entry: str | Sequence[Change]) -> None:
         """Edit the document, once that is on disk.
 
-        :param entry: changes, :data:`UNDO`, :data:`REDO`, or :data:`SAVED` where all edits are in the file of
-            labels.
+        :param entry: changes, :data:`UNDO`, :data:`REDO`, or :data:`SAVED` where the file has all edits.
         :raises BadInput: there is nothing to undo or to redo.
         """
         if entry in (UNDO, REDO) and not (self.document.done if entry == UNDO else self.document.undone):
@@ -250,13 +246,11 @@ class Journal:
 
     def at(self, address: str = "") -> None:
         """Say who has the file, and where it can be edited, for processes that are refused."""
-        self._lock.write_text(
-            f"a process of {getpass.getuser()}, {os.getpid()}{address and f', at {address}'}"
-        )
+        where = address and f", at {address}"
+        self._lock.write_text(f"a process of {getpass.getuser()}, {os.getpid()}{where}")
 
     def others(self) -> dict[str, Document]:
-        """What each other annotator has said by now, by name; journals of other demonstrations are passed
-        over.
+        """What each other annotator has said by now, by name; skips journals of other demonstrations.
 
         The journals of annotators lie side by side, as ``<start>_<annotator>.<end>``.
         """

@@ -1,4 +1,4 @@
-"""Features of the pictures of demonstrations, computed once, which the recogniser of a page of labels reads."""
+"""Features of the pictures of demonstrations, computed once, which the recogniser of a labels page reads."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ class Features:
     """What a frozen backbone says of each step's pictures, those of all cameras together.
 
     :param path: the demonstrations.
-    :param folder: has a file for each demonstration: its features [T, F] less their mean over the
-        demonstration.
+    :param folder: has a file for each demonstration: its features [T, F] less their mean over it.
     """
 
     path: Path
@@ -48,8 +47,7 @@ class Features:
 
     @classmethod
     def of(cls, path: Path, out: Path, backbone: str, allow_code: bool, where: Where) -> Features:
-        """The features of a file beside its labels, in a folder of these demonstrations, pictures and
-        backbone.
+        """The features of a file beside its labels, in a folder of its demonstrations, pictures, backbone.
 
         :param out: the labels.
         :param backbone: as :class:`~ddco_pyro.encoding.Backbone` takes it.
@@ -60,18 +58,15 @@ class Features:
             demos = [source.read(name) for name in source.names]
             few = [pictures[:TRIED] for pictures in _cameras(demos[0])]
         if not few:
-            raise BadInput(
-                f"--features: {path} has no pictures, uint8 [steps, height, width, channels]; leave it out"
-            )
-        key = hashlib.sha256(
-            f"{digest(demos, backbone)} {[pictures.shape for pictures in few]}".encode() + network.code
-        )
+            wanted = "uint8 [steps, height, width, channels]"
+            raise BadInput(f"--features: {path} has no pictures, {wanted}; leave it out")
+        known = f"{digest(demos, backbone)} {[pictures.shape for pictures in few]}"
+        key = hashlib.sha256(known.encode() + network.code)
         for pictures in few:
             network.try_out(pictures)
             key.update(pictures.tobytes())
-        return cls(
-            path, backbone, allow_code, where, out.with_name(f"{path.stem}.features") / key.hexdigest()[:16]
-        )
+        folder = out.with_name(f"{path.stem}.features") / key.hexdigest()[:16]
+        return cls(path, backbone, allow_code, where, folder)
 
     def computed(self, on_event: OnEvent = ignore) -> dict[str, np.ndarray]:
         """Principal components of what changes within demonstrations, float32 [T, N] of each.
@@ -88,9 +83,8 @@ class Features:
                 try:
                     each[name] = np.load(file, mmap_mode="r")
                 except (OSError, ValueError, EOFError):  # it is missing or damaged
-                    rows = np.concatenate(
-                        [network.features(own) for own in _cameras(source.read(name))], axis=1
-                    )
+                    cameras = _cameras(source.read(name))
+                    rows = np.concatenate([network.features(own) for own in cameras], axis=1)
                     with whole_file(file) as temporary, temporary.open("wb") as opened:
                         np.save(opened, rows - rows.mean(0))
                     each[name] = np.load(file, mmap_mode="r")

@@ -41,9 +41,8 @@ class Following:
     def __init__(self, path: Path, demos: Demonstrations, trajectory: Sequence[PathSpec] | None) -> None:
         self.path, self.demos, self.paths, self.opened = path, demos, trajectory or (), ExitStack()
         known: dict[str, list[str]] = json.loads(str(demos.attributes.get(DIMENSION_NAMES, "{}")))
-        self.names = {
-            f"{key}[{n}]": f"{key} {name}" for key, names in known.items() for n, name in enumerate(names)
-        }
+        named = ((key, n, name) for key, names in known.items() for n, name in enumerate(names))
+        self.names = {f"{key}[{n}]": f"{key} {name}" for key, n, name in named}
         self.cameras, self.block = lru_cache(KEPT)(self._cameras), lru_cache(KEPT)(self._block)
         self.lock = Lock()
 
@@ -73,12 +72,8 @@ class Following:
             numbers = {**numbers, "names": [self.names.get(name, name) for name in numbers["names"]]}
         with self.lock:
             cameras = [*self.cameras(index)]
-        return {
-            "numbers": numbers,
-            "paths": found.get("paths"),
-            "view": found.get("view"),
-            "cameras": cameras,
-        }
+        drawn = {key: found.get(key) for key in ("paths", "view")}
+        return {"numbers": numbers, **drawn, "cameras": cameras}
 
     def picture(self, index: int, camera: int, step: int) -> bytes:
         """The picture of a step as JPEG.

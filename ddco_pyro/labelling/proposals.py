@@ -1,4 +1,4 @@
-"""What a model makes of demonstrations, given what a person has said of some steps, and what is expected wrong."""
+"""What a model makes of demonstrations, given what a person has said of some steps, and what may be wrong."""
 
 from __future__ import annotations
 
@@ -31,8 +31,11 @@ from ddco_pyro.segmenting.segments import LevelLabels, Segmented, Segments, segm
 from ddco_pyro.statistics import matching
 from ddco_pyro.training.recognition import half_widths, learn, typical_length
 
+StepLabels = Mapping[str, np.ndarray]
+"""An option of each step, [T], by demonstration; below 1 for none."""
+
 Pictures = Mapping[str, np.ndarray]
-"""Features of the pictures of each step, [T, F] of each demonstration by name, which recognisers read; may be empty."""
+"""Features of the pictures of each step, [T, F] by demonstration, which recognisers read; may be empty."""
 
 RIDGE = 50.0
 """Of the recogniser of the steps that a person has named."""
@@ -72,17 +75,14 @@ def windows_of(
     batches: Iterable[tuple[Sequence[str], Batch]],
     seen: Pictures,
 ) -> tuple[Windows, list[Tensor]]:
-    """A recogniser of so many options that has learned nothing yet, and what it reads, [N, T, 3 F] of each
-    batch.
+    """A recogniser of so many options that has learned nothing yet; what it reads, [N, T, 3 F] of each batch.
 
     :param typical: the length of a segment.
     :param batches: with the names of their demonstrations.
     """
+    found = list[Tensor]()
     size = next((rows.shape[1] for rows in seen.values()), 0)
-    windows, found = (
-        Windows(count, model.input_shape, len(model.scaling.varying), past=False, pictures=size),
-        [],
-    )
+    windows = Windows(count, model.input_shape, len(model.scaling.varying), past=False, pictures=size)
     windows.widths.copy_(half_widths(typical))
     for names, batch in batches:
         read = batch.actions
@@ -126,18 +126,18 @@ class Proposals:
         fit: Fit,
         demos: Demonstrations,
         level: int,
-        labels: Mapping[str, np.ndarray],
+        labels: StepLabels,
         count: int,
-        before: Mapping[str, np.ndarray] = MappingProxyType({}),
+        before: StepLabels = MappingProxyType({}),
         seen: Pictures = MappingProxyType({}),
     ) -> None:
         self.fit, self.level = fit, level
         levels = fit.spec.hierarchy.levels if fit.spec.hierarchy else ()
         self.size = levels[level - 1].count
         self.pieces = list(fit.infer(demos))
-        self.place = {
-            name: (piece, row) for piece, own in enumerate(self.pieces) for row, name in enumerate(own.names)
-        }
+        self.place = dict[str, tuple[int, int]]()
+        for place, piece in enumerate(self.pieces):
+            self.place |= {name: (place, row) for row, name in enumerate(piece.names)}
         with torch.no_grad():
             self.alone = [piece.outputs.tables(piece.batch.actions) for piece in self.pieces]
         alone = [
@@ -145,12 +145,8 @@ class Proposals:
             for piece, tables in zip(self.pieces, self.alone, strict=True)
         ]
         self.alone_u = [piece.posterior.u[level - 1] for piece in alone]
-        every_run = [
-            run
-            for piece in alone
-            for row in range(len(piece.names))
-            for run in runs(*piece.segmented(row)[level - 1])
-        ]
+        rows = [piece.segmented(row)[level - 1] for piece in alone for row in range(len(piece.names))]
+        every_run = [run for row in rows for run in runs(*row)]
         self.occurring = {option for option, _, _ in every_run} - {0}
         typical = float(np.median([stop - start for _, start, stop in every_run]))
         self.half = typical / 2
@@ -168,18 +164,13 @@ class Proposals:
         for piece in self.infer(demos.names, labels):
             self.paths |= self.found(piece)
 
-    def renumber(
-        self,
-        labels: Mapping[str, np.ndarray],
-        count: int,
-        before: Mapping[str, np.ndarray] = MappingProxyType({}),
-    ) -> None:
+    def renumber(self, labels: StepLabels, count: int, before: StepLabels = MappingProxyType({})) -> None:
         """Number the options anew, as the person has other ones; arguments as of the class."""
         self.usual = self._common(before, count) if before else np.eye(self.size, count)
         self.usual *= self.half / self.usual.sum(1, keepdims=True).clip(min=1)
         self.number(labels)
 
-    def number(self, labels: Mapping[str, np.ndarray]) -> bool:
+    def number(self, labels: StepLabels) -> bool:
         """Number the options by the named steps: each is another option of the person where there are enough.
 
         Options keep their numbers unless named steps are against it by more than half a segment of each. An
@@ -197,8 +188,8 @@ class Proposals:
         before, self.options = self.options, np.array([0, *(np.where(matched < 0, best, matched) + 1)])
         return not np.array_equal(before, self.options)
 
-    def _common(self, labels: Mapping[str, np.ndarray], count: int) -> np.ndarray:
-        """The steps that the model by itself expects to have in common with labels 1 to count, [its options, count]."""
+    def _common(self, labels: StepLabels, count: int) -> np.ndarray:
+        """The steps that the model by itself expects to share with labels 1 to count [its options, count]."""
         common = np.zeros((count, self.size))
         for name, own in labels.items():
             piece, row = self.place[name]
@@ -206,7 +197,7 @@ class Proposals:
             np.add.at(common, own[said] - 1, self.alone_u[piece][row, said, 1:].numpy())
         return common.T
 
-    def unknown(self, labels: Mapping[str, np.ndarray]) -> Tensor:
+    def unknown(self, labels: StepLabels) -> Tensor:
         """The options of the model that occur, and that no named step tells of.
 
         Such an option has none, and the named ones are not those that the model by itself gives to it.
@@ -215,17 +206,17 @@ class Proposals:
         seen = (1 + np.flatnonzero(self.told > self.half)).tolist()
         return torch.tensor(sorted(self.occurring - {*named, *seen}), dtype=torch.int64)
 
-    def waiting(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
+    def waiting(self, labels: StepLabels) -> np.ndarray:
         """The person's options that occur, and that no named step tells of."""
         return self.options[self.unknown(labels).numpy()]
 
     def _by_model(self, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The named steps of a demonstration whose label stands for one option of the model, and that option."""
+        """The named steps of a demonstration whose label stands for one option of the model; that option."""
         counts = np.bincount(self.options[self.options > 0], minlength=labels.max(initial=0) + 1)
         said = np.flatnonzero((labels > 0) & (counts[labels.clip(0)] == 1))
         return said, (self.options[1:] == labels[said, None]).argmax(1) + 1
 
-    def learn(self, labels: Mapping[str, np.ndarray]) -> Learned:
+    def learn(self, labels: StepLabels) -> Learned:
         """Learn the recogniser of the named steps."""
         each = {name: self._by_model(labels[name]) for name in self.place}
         options = torch.as_tensor(np.concatenate([own for _, own in each.values()]))
@@ -235,12 +226,10 @@ class Proposals:
             learn(windows := deepcopy(self.windows), rows, options, RIDGE)
         return Learned(windows, unknown)
 
-    def infer(self, names: Iterable[str], labels: Mapping[str, np.ndarray]) -> Iterator[Inferred]:
-        """The posterior of some demonstrations, a few at a time: named steps are clamped, the recogniser is
-        evidence.
+    def infer(self, names: Iterable[str], labels: StepLabels) -> Iterator[Inferred]:
+        """The posterior of some demonstrations, a few at a time: named steps clamped, recogniser as evidence.
 
-        The recogniser says nothing of steps that the model by itself gives to an option that is unknown to
-        it.
+        The recogniser says nothing of steps that the model by itself gives to an option unknown to it.
         """
         rows: dict[int, list[int]] = {}
         for name in names:
@@ -255,9 +244,8 @@ class Proposals:
                 leaves = [None if table is None else table[some, steps] for table in alone.leaves()]
                 tables = Tables.of(alone.depth, leaves, alone.power)
                 if self.learned.windows is not None:
-                    silent = torch.isin(
-                        self.alone_u[place][some, steps].argmax(-1), self.learned.unknown
-                    ).unsqueeze(-1)
+                    likeliest = self.alone_u[place][some, steps].argmax(-1)
+                    silent = torch.isin(likeliest, self.learned.unknown).unsqueeze(-1)
                     ratio = gamma * self.learned.windows.log_ratio(self.features[place][some, steps])
                     tables = tables.with_evidence(level, torch.where(silent, 0.0, ratio))
                 chosen = tuple(piece.names[row] for row in some.tolist())
@@ -273,7 +261,7 @@ class Proposals:
             found[name] = path, np.minimum(u[row, np.arange(steps), path], 1.0)
         return found
 
-    def held_out(self, labels: Mapping[str, np.ndarray], names: Iterable[str]) -> dict[str, Shown]:
+    def held_out(self, labels: StepLabels, names: Iterable[str]) -> dict[str, Shown]:
         """What would be shown of each of these demonstrations if nothing were said of it.
 
         The recogniser is learned without its labels; the model stays, which may have been trained with them.
@@ -335,10 +323,9 @@ def labels_shown(document: Document, name: str, shown: Shown) -> LevelLabels:
 def sources_shown(document: Document, name: str) -> np.ndarray:
     """The place in :data:`~ddco_pyro.data.labels.SOURCES` of who says what each step is, [T]."""
     labels = document.labels[name]
-    said = np.where(document.given[name], SOURCES.index("given"), SOURCES.index("accepted"))
-    return np.select(
-        [labels == OPEN, labels == FREE], [SOURCES.index("open"), SOURCES.index("proposed")], said
-    )
+    given, accepted, opened, proposed = map(SOURCES.index, ("given", "accepted", "open", "proposed"))
+    said = np.where(document.given[name], given, accepted)
+    return np.select([labels == OPEN, labels == FREE], [opened, proposed], said)
 
 
 def said_segments(
@@ -373,8 +360,7 @@ def said_in(
 
     Labels that ``segment`` wrote say nothing: a model proposed them.
 
-    :param names: of the options 1 to k, as the run has them. A name that none of them has is given to one
-        that has no name of its own, or is new.
+    :param names: of the options 1 to k, as the run has them. Another name goes to one without, or is new.
     :param lerobot: whether the labels are the subtasks of a LeRobot dataset.
     :param marked: whether marks of demonstrations are read, too.
     """
@@ -398,9 +384,8 @@ def said_in(
         options[value] = found.index(name) + 1
     for demo in demos:
         labels = demo.labels.get(level, np.full(len(demo), UNKNOWN))
-        sources = demo.labels.get(
-            level + SOURCE, np.where(labels == UNKNOWN, UNKNOWN, SOURCES.index("given"))
-        )
+        given = np.where(labels == UNKNOWN, UNKNOWN, SOURCES.index("given"))
+        sources = demo.labels.get(level + SOURCE, given)
         edges = (np.diff(labels, prepend=-9) != 0) | (np.diff(sources, prepend=-9) != 0)
         for value, start, stop in runs(labels, edges):
             source = "proposed" if sources[start] == UNKNOWN else words[sources[start]]
@@ -447,9 +432,8 @@ def first_wrong(first: Shown, accepted: Shown) -> tuple[float, int]:
     """
     found = agreement([first.options], [accepted.options])
     assert found is not None  # there are steps
-    return float((1 - first.probability).sum()), round(
-        (1 - found.matched_globally.accuracy) * len(first.options)
-    )
+    wrong = round((1 - found.matched_globally.accuracy) * len(first.options))
+    return float((1 - first.probability).sum()), wrong
 
 
 def excess(proposed: Shown, labels: np.ndarray) -> float:
@@ -458,9 +442,8 @@ def excess(proposed: Shown, labels: np.ndarray) -> float:
     :param labels: an option of each step, [T]; below 1 where none is named.
     """
     said = labels > 0
-    return (
-        float(((proposed.options != labels) - (1 - proposed.probability))[said].mean()) if said.any() else 0.0
-    )
+    more = (proposed.options != labels) - (1 - proposed.probability)
+    return float(more[said].mean()) if said.any() else 0.0
 
 
 def unforeseen(first: Sequence[float], held_out: Sequence[float]) -> float:
@@ -469,8 +452,7 @@ def unforeseen(first: Sequence[float], held_out: Sequence[float]) -> float:
     It is the mean of what was in excess in demonstrations that were held out. The mean of all first proposals
     counts as one more of these: it alone is known of a single demonstration.
 
-    :param first: of each accepted demonstration, :func:`excess` of what was shown before anything was said of
-        it.
+    :param first: of each accepted demonstration, :func:`excess` of what was shown before anything was said.
     :param held_out: the same of what the model says without its labels.
     """
     if not first:
@@ -479,8 +461,7 @@ def unforeseen(first: Sequence[float], held_out: Sequence[float]) -> float:
 
 
 def expected_wrong(shown: Shown, labels: np.ndarray, sure: float) -> float:
-    """The expected number of wrong steps of a demonstration, Σ (1 - p) + ε p over those of which nothing is
-    said.
+    """The expected number of wrong steps of a demonstration, Σ (1 - p) + ε p over those not said.
 
     :param sure: ε, as :func:`unforeseen` gives it.
     """

@@ -50,8 +50,7 @@ def refit(
     options that a recogniser of the labelled steps finds. Other models are fitted as their spec says.
 
     :param labels: an option of each step, [T], by demonstration; below 1 for none.
-    :param kept: the option that each step begins with whatever the recogniser finds, [T], by demonstration;
-        below 1 for none.
+    :param kept: the option that each step begins with whatever the recogniser finds, likewise.
     :param seen: read by the recogniser of a single level that EM trains.
     """
     spec, before = refit_spec(trained, level, count), trained.hierarchy
@@ -68,9 +67,8 @@ def refit(
         named = Labels(1, tuple(range(1, count + 1)), names, known, known)
         data = TrainingData(spec, size, batch, batch, names, fitted_of(before), named)
         model = data.hierarchy(0)
-        windows, (features,) = windows_of(
-            before, count, typical_length(known.numpy()), [(names, batch)], seen
-        )
+        typical = typical_length(known.numpy())
+        windows, (features,) = windows_of(before, count, typical, [(names, batch)], seen)
         learn(windows, features[known > 0], known[known > 0], RIDGE)
         own = _padded([kept[name] for name in names])
         silent, alive = own > 0, torch.arange(known.shape[1]) < batch.lengths[:, None]
@@ -84,7 +82,7 @@ def refit(
 
 
 def _tuned(spec: Spec, demos: Demonstrations) -> Demonstrations:
-    """The demonstrations, of which those without labels tune where there are any: the labelled ones are few."""
+    """The demonstrations, of which those without labels tune where there are any: labelled ones are few."""
     free = [demo.name for demo in demos if (demo.labels[SAID] < 1).all()]
     number = max(1, round(spec.training.tune_fraction * len(demos)))
     drawn = np.random.default_rng(spec.seed).permutation(free)[:number].tolist()
@@ -98,7 +96,7 @@ def _padded(rows: list[np.ndarray]) -> Tensor:
 
 
 def refit_spec(trained: Fit, level: str, count: int) -> Spec:
-    """The spec of a quick fit with the labels :data:`SAID`: the model alone, and a recogniser of the named steps."""
+    """The spec of a quick fit with labels :data:`SAID`: the model alone, a recogniser of the named steps."""
     assert trained.spec.hierarchy is not None
     place = [own.name for own in trained.spec.hierarchy.levels].index(level)
     recogniser = {"weight": weight(float(trained.hierarchy.power)), "ridge": RIDGE}
@@ -114,11 +112,10 @@ def refit_spec(trained: Fit, level: str, count: int) -> Spec:
     }
     if _by_em(trained):
         ridge = trained.metrics.training.raised_ridge or trained.spec.training.optimizer.ridge.policy
-        known = {"policy": ridge, "cross_validated": False}
         changes["training.tune_fraction"] = 0.0  # the few labelled demonstrations are to be trained with
-        changes |= {"training.epochs": EPOCHS} | {
-            f"training.optimizer.ridge.{key}": own for key, own in known.items()
-        }
+        changes["training.epochs"] = EPOCHS
+        changes["training.optimizer.ridge.policy"] = ridge
+        changes["training.optimizer.ridge.cross_validated"] = False
     return with_overrides(trained.spec, changes)
 
 

@@ -1,7 +1,6 @@
 """The local web server of ``ddco-pyro label``: a :class:`Session` over HTTP, and the page that shows it.
 
-It listens on this machine alone. The first part of every path is a random token, and a foreign ``Host`` is
-refused.
+It listens on this machine alone. Every path begins with a random token, and a foreign ``Host`` is refused.
 """
 
 from __future__ import annotations
@@ -47,8 +46,8 @@ PAGE, CANVAS = files("ddco_pyro") / "labelling" / "static", files("ddco_pyro") /
 
 HEADERS = {
     "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' "
+    "data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "same-origin",
@@ -73,9 +72,8 @@ class Listening:
         try:
             return cls(socket.create_server((LOOPBACK, port)))
         except (OSError, OverflowError) as error:
-            raise Failed(
-                f"port {port}: {reason(OSError(*error.args))}; choose another one with --port"
-            ) from error
+            why = reason(OSError(*error.args))
+            raise Failed(f"port {port}: {why}; choose another one with --port") from error
 
     @property
     def address(self) -> str:
@@ -130,10 +128,9 @@ def application(sessions: Sequence[Session], token: str) -> Starlette:
         return found
 
     async def refused(request: Request, error: Exception) -> Response:
-        status, text = (
-            (error.status_code, error.detail) if isinstance(error, HTTPException) else (500, reason(error))
-        )
-        return JSONResponse({"error": text}, status)
+        if isinstance(error, HTTPException):
+            return JSONResponse({"error": error.detail}, error.status_code)
+        return JSONResponse({"error": reason(error)}, 500)
 
     levels = [Mount(f"/level/{number}", routes=_answers(session)) for number, session in enumerate(sessions)]
     page = Mount("/", StaticFiles(directory=str(PAGE), html=True))

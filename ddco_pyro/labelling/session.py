@@ -72,9 +72,8 @@ def read(path: Path, needed: Iterable[str] = (), where: Where = NOTHING) -> Demo
     with open_source(path, where=where) as source:
         each = []
         for demo in map(source.read, source.names):
-            seen = {
-                key: own for key, own in demo.observations.items() if key in needed or not is_picture(own)
-            }
+            every = demo.observations.items()
+            seen = {key: own for key, own in every if key in needed or not is_picture(own)}
             each.append(Demonstration(demo.name, seen, demo.actions, demo.labels, demo.attributes))
         rate = {FREQUENCY: source.frequency} if source.frequency else {}
         return Demonstrations(tuple(each), source.masks, {**source.attributes, **rate})
@@ -83,8 +82,7 @@ def read(path: Path, needed: Iterable[str] = (), where: Where = NOTHING) -> Demo
 class Session:
     """Labels of one level of a run's options, which people correct.
 
-    Every method may be called from any thread. Steps are counted from 0, and ``stop`` is the step after the
-    last.
+    Every method may be called from any thread. Steps count from 0; ``stop`` is the step after the last.
 
     :param fit: has options.
     :param path: an HDF5 file of demonstrations, or a LeRobot dataset.
@@ -94,8 +92,7 @@ class Session:
     :param team: who labels, and who labels what.
     :param first: the session of another level, whose demonstrations and marks are those of this one.
     :param where: attributes and values of the demonstrations to label; all if empty.
-    :param features: of pictures, which the recognisers of all levels read once they are computed; of the
-        first session.
+    :param features: of pictures, which recognisers of all levels read once computed; of the first session.
     :ivar beside: the sessions of the other levels.
     :raises BadInput: the run has no options or no such level, ``out`` is something else, or another process
         labels it.
@@ -123,9 +120,8 @@ class Session:
         self.beside = list[Session]()
         self.demos: Demonstrations = first.demos if first else read(path, fit.hierarchy.encoder.shapes, where)
         if (tasks := fit.hierarchy.encoder.tasks) and not first:
-            self.demos = replace(
-                self.demos, demonstrations=tuple(with_task(demo, tasks) for demo in self.demos)
-            )
+            each = tuple(with_task(demo, tasks) for demo in self.demos)
+            self.demos = replace(self.demos, demonstrations=each)
         self.form, self.in_place = format_of(path), out.exists() and out.samefile(path)
         self._check_out()
         self.files = [file for file in (path, *path.rglob("*")) if file.is_file()]
@@ -146,9 +142,8 @@ class Session:
         self.refits, self.again = 0, False
         self.features, self.seen = features, dict[str, np.ndarray]()
         self.encoding: Background = first.encoding if first else Background(self.lock, lambda: None)
-        self.background = Background(
-            self.lock, self._ended, "ddco_pyro.labelling.refitting", "sklearn.linear_model"
-        )
+        modules = ("ddco_pyro.labelling.refitting", "sklearn.linear_model")
+        self.background = Background(self.lock, self._ended, *modules)
         self.shown, self.untouched, self.sure = dict[str, Shown](), dict[str, Shown](), 0.0
         self.view = View(self.document, self.shown, self.untouched)
         self.segments, self.recent = dict[str, list[Segment]](), dict[str, Inferred]()
@@ -168,7 +163,7 @@ class Session:
             check_labels(self.path, [self.level, self.level + SOURCE], self.demos.names)
 
     def begin(self) -> None:
-        """Compute features of pictures, and refit where something is labelled; else have the process ready for it."""
+        """Compute features of pictures, and refit if something is labelled; else have the process ready."""
         if self.features:
             self.encoding.begin(self.features.computed, self._look)
         if self._is_labelled():
@@ -218,7 +213,7 @@ class Session:
         return {name: shown.options for name, shown in self.shown.items()}
 
     def _show(self, names: Iterable[str], edited: str | None = None) -> None:
-        """Show what is known of demonstrations, and mark those in which it differs from what was shown before."""
+        """Show what is known of demonstrations, and mark those where it differs from what was shown."""
         for name in names:
             before, labels = self.shown.get(name), self.document.labels[name]
             shown = self.shown[name] = self.proposals.shown(name, labels)
@@ -320,12 +315,8 @@ class Session:
     def state(self) -> dict[str, Any]:
         """Everything but the demonstrations themselves."""
         with self.lock:
-            document, names, others, wrong = (
-                self.document,
-                self.demos.names,
-                self.journal.others(),
-                self._wrong(),
-            )
+            document, names = self.document, self.demos.names
+            others, wrong = self.journal.others(), self._wrong()
             demos = [
                 {
                     "name": name,
@@ -391,9 +382,8 @@ class Session:
         if self.document.accepted:
             return False
         named = {name: own > 0 for name, own in labels.items() if name in self.untouched}
-        wrong = sum(
-            int((self.untouched[name].options != labels[name])[said].sum()) for name, said in named.items()
-        )
+        differ = {name: self.untouched[name].options != labels[name] for name in named}
+        wrong = sum(int(differ[name][said].sum()) for name, said in named.items())
         total = sum(int(said.sum()) for said in named.values())
         return total * TENTH >= min(self.document.lengths.values()) and wrong > total / 2
 
@@ -401,8 +391,7 @@ class Session:
         """What changes by itself.
 
         ``revision`` is larger after each change of what is shown. While it is ``behind``, edits have effects
-        on other demonstrations that are not shown yet. ``dirty`` says that the journal has labels that the
-        file lacks.
+        on other demonstrations that are not shown yet. ``dirty``: the journal has labels that the file lacks.
         """
         with self.lock:
             return {
@@ -420,8 +409,7 @@ class Session:
             }
 
     def summary(self) -> dict[str, Any]:
-        """The expected share of wrong steps, how much of it is in the demonstration to label next, and
-        labelled ones.
+        """The expected share of wrong steps, its part in the demonstration to label next, and labelled ones.
 
         Both shares are None before anything is accepted.
         """
@@ -437,15 +425,10 @@ class Session:
     def warnings(self) -> list[str]:
         """What a person should know: a changed file, a failure, demonstrations unlike those of the fit."""
         changed = f"{self.path} changed while it was labelled; start again to go on with it"
-        features = (
-            self.encoding.error
-            and f"features of pictures: {self.encoding.error}; proposals go on without them"
-        )
-        return [
-            *([] if self._unchanged() else [changed]),
-            *filter(None, [self.error, features]),
-            *self.unlike,
-        ]
+        failed = self.encoding.error
+        features = failed and f"features of pictures: {failed}; proposals go on without them"
+        known = ["" if self._unchanged() else changed, self.error, features]
+        return [*filter(None, known), *self.unlike]
 
     def _features_said(self) -> str:
         """How far features of pictures are, in words."""
@@ -515,15 +498,10 @@ class Session:
         """What another annotator says of a demonstration, and how that agrees with this one."""
         labels, ours = own.labels[name], self.document.names
         colour = dict(zip(ours, self.colours, strict=True))
-        segments = [
-            {
-                "start": start,
-                "stop": stop,
-                "option": max(value, 0),
-                "source": "open" if value < 0 else "given",
-            }
-            for value, start, stop in runs(labels, np.diff(labels, prepend=-9))
-        ]
+        segments = []
+        for value, start, stop in runs(labels, np.diff(labels, prepend=-9)):
+            said = {"option": max(value, 0), "source": "open" if value < 0 else "given"}
+            segments.append({"start": start, "stop": stop, **said})
         return {
             "annotator": other,
             "names": list(own.names),
@@ -546,9 +524,8 @@ class Session:
         with self.lock:
             name = self._name(index)
             here, segments, proposals = self.view.at(name, step), dict(self.segments), self.proposals
-        centres = {
-            other: proposals.centres(other, [one.start for one in own]) for other, own in segments.items()
-        }
+        starts = {other: [one.start for one in own] for other, own in segments.items()}
+        centres = {other: proposals.centres(other, own) for other, own in starts.items()}
         mine, found = centres[name][segments[name].index(here)], []
         for place, other in enumerate(self.demos.names):
             if other != name:
@@ -569,19 +546,15 @@ class Session:
         with self.lock:
             do, document = command.get("do"), self.document
             index = whole(command, "demo") if "demo" in command else None
-            name, names, shown = (
-                None if index is None else self._name(index),
-                document.names,
-                self._shown_now(),
-            )
+            name = None if index is None else self._name(index)
+            names, shown = document.names, self._shown_now()
             if do == "mark" and self.first is not self:
                 return self.first.edit(command)
             if do in ("undo", "redo"):
                 self.journal.write(str(do))
             else:
-                asked = (
-                    self._taken(name, command) if do == "take" else self.view.changes(str(do), name, command)
-                )
+                took = do == "take"
+                asked = self._taken(name, command) if took else self.view.changes(str(do), name, command)
                 changes = list(filter(document.alters, asked))
                 if not changes:
                     return {"revision": self.revision, "demo": index, "done": False}
@@ -623,7 +596,7 @@ class Session:
         self._show(self.demos.names)
 
     def _follow(self, touched: Sequence[str], edited: str | None) -> None:
-        """Show what follows from an edit at once: the demonstration at hand, and the numbers of options everywhere."""
+        """Show what follows from an edit at once: the demonstration at hand, and numbers of all options."""
         renumbered = self.proposals.number(self.document.labels)
         self.proposed.number(self.document.labels)
         if edited is not None:
@@ -655,8 +628,7 @@ class Session:
     # --- in the background ----------------------------------------------------------------------------------
 
     def refit(self) -> None:
-        """Fit again in another process, with the labels and a recogniser of them; what comes of it is shown
-        then.
+        """Fit again in another process, with the labels and a recogniser of them; then the result is shown.
 
         A refit that is asked for meanwhile begins when this one has ended.
         """
@@ -710,13 +682,10 @@ class Session:
     def _observed(self) -> Demonstrations:
         """The demonstrations with what the run's networks observe alone."""
         keys = self.run.hierarchy.encoder.shapes
-        return Demonstrations(
-            tuple(
-                replace(demo, observations={key: demo.observations[key] for key in keys})
-                for demo in self.demos
-            ),
-            attributes=self.demos.attributes,
-        )
+        seen = [{key: demo.observations[key] for key in keys} for demo in self.demos]
+        pairs = zip(self.demos, seen, strict=True)
+        each = tuple(replace(demo, observations=own) for demo, own in pairs)
+        return Demonstrations(each, attributes=self.demos.attributes)
 
     def cancel(self) -> None:
         """End a refit at once; what is shown stays."""
@@ -761,12 +730,9 @@ class Session:
 
     @property
     def formats(self) -> list[str]:
-        """Those of ``segment`` that the page offers: all that take the demonstrations, without the copy with labels."""
-        return [
-            option[2:]
-            for option, form in FORMATS.items()
-            if form.takes in ("", self.form) and option != "--out"
-        ]
+        """Those of ``segment`` that the page offers: all that take the demonstrations, except ``--out``."""
+        taking = [option for option, form in FORMATS.items() if form.takes in ("", self.form)]
+        return [option[2:] for option in taking if option != "--out"]
 
     def export(self, form: str, folder: Path) -> Path:
         """Write the shown segments in one of :attr:`formats` into a folder, without excluded demonstrations.
@@ -783,9 +749,8 @@ class Session:
                 segmented = shown_segments(self.fit, source, self.level, self.shown, self.document)
             marks, whole = self.first.document.marks, about.takes == "lerobot"
             kept = tuple(demo for demo in segmented.segments if whole or demo.name not in self.excluded)
-            self._write(
-                f"--{form}", place, source, replace(segmented, segments=kept, marks=marks), self.level
-            )
+            segmented = replace(segmented, segments=kept, marks=marks)
+            self._write(f"--{form}", place, source, segmented, self.level)
         return place
 
     def close(self) -> None:
@@ -803,12 +768,8 @@ class Session:
 
 
 def _band(step: int, drawn: np.ndarray) -> dict[str, Any]:
-    """A boundary with its 90 % interval and, within it, how often draws have each step, beside the most frequent."""
+    """A boundary with its 90 % interval, and how often draws have each step in it beside the most frequent."""
     low, high = within(drawn, step)
     often = np.bincount(drawn[(drawn >= low) & (drawn <= high)] - low, minlength=high - low + 1)
-    return {
-        "step": step,
-        "low": low,
-        "high": high,
-        "density": text(np.rint(255 * often / max(often.max(), 1))),
-    }
+    density = text(np.rint(255 * often / max(often.max(), 1)))
+    return {"step": step, "low": low, "high": high, "density": density}

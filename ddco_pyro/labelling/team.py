@@ -37,9 +37,8 @@ class Team:
             if name and not name.replace("-", "").replace("_", "").isalnum():
                 raise BadInput(f"--annotator {name}: use letters, digits, - and _")
         if self.members and (self.me not in self.members or len({*self.members}) < len(self.members)):
-            raise BadInput(
-                f"--team {','.join(self.members)}: name each annotator once, and yourself with --annotator"
-            )
+            wanted = "name each annotator once, and yourself with --annotator"
+            raise BadInput(f"--team {','.join(self.members)}: {wanted}")
         if self.twice and len(self.members) < 2:
             raise BadInput("--twice: two annotators share demonstrations; name them with --team")
 
@@ -77,14 +76,11 @@ def taken(mine: Document, theirs: Document, name: str) -> list[Change]:
     """The changes that make one's labels of a demonstration those of another annotator, by names."""
     new = [text for text in theirs.names if text not in mine.names]
     names = [*mine.names, *new]
-    numbers = {FREE: FREE, OPEN: OPEN} | {
-        n: names.index(text) + 1 for n, text in enumerate(theirs.names, start=1)
-    }
+    numbers = {n: names.index(text) + 1 for n, text in enumerate(theirs.names, start=1)}
+    numbers |= {FREE: FREE, OPEN: OPEN}
     labels = theirs.labels[name]
-    painted = [
-        (PAINT, name, start, stop, numbers[value])
-        for value, start, stop in runs(labels, np.diff(labels, prepend=-9))
-    ]
+    segments = runs(labels, np.diff(labels, prepend=-9))
+    painted = [(PAINT, name, start, stop, numbers[value]) for value, start, stop in segments]
     cuts = [("cut", name, step, True) for step in sorted(theirs.cuts[name])]
     gone = [("cut", name, step, False) for step in sorted(mine.cuts[name] - theirs.cuts[name])]
     return [("names", names), *painted, *cuts, *gone]

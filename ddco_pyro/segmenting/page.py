@@ -25,10 +25,10 @@ from ddco_pyro.segmenting.segments import Segmented, Segments
 from ddco_pyro.spec import PathSpec
 
 HOW = (
-    "Time runs to the right. Colours are options; the height of a band is the posterior probability of its option. A "
-    "bar below a boundary is the 90 % interval of its step, over draws from the posterior. Rows without such bands are "
-    "labels: each has the colour of the option that it is matched with, or is grey. Numbers, paths and pictures below "
-    "follow the cursor."
+    "Time runs to the right. Colours are options; the height of a band is the posterior probability of its "
+    "option. A bar below a boundary is the 90 % interval of its step, over draws from the posterior. Rows "
+    "without such bands are labels: each has the colour of the option that it is matched with, or is grey. "
+    "Numbers, paths and pictures below follow the cursor."
 )
 
 
@@ -38,12 +38,11 @@ def write_page(path: Path, segmented: Segmented, run: str, file: str, drawn: Tim
     :param drawn: of :func:`timelines`.
     """
     count, held_out = len(segmented), sum(demo.held_out for demo in segmented.segments)
-    intro = f"{held_out} of {count} demonstrations were held out when the run was fitted. They are marked “held out”."
+    which = f"{held_out} of {count} demonstrations"
+    intro = f"{which} were held out when the run was fitted. They are marked “held out”."
     sections = [_level(name, segmented) for name in segmented.counts]
-    how = note(
-        f"{HOW} Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}."
-    )
-    sections.append(Section("segments", "Every demonstration", [how, drawn]))
+    nats = f"Nats per step: the log-likelihood of the demonstration's controls under the model; {NAT}."
+    sections.append(Section("segments", "Every demonstration", [note(f"{HOW} {nats}"), drawn]))
     page = Page(file, [Text(intro)] if held_out else [], sections, subtitle=f"segmented by {run}")
     write_text(path, page.html())
 
@@ -81,10 +80,8 @@ def use_by_task(segmented: Segmented, level: str) -> list[Block]:
         if option or any(shares):
             named = Cell(numbered_name(option, names), colour=option_colour(option))
             rows.append([named, *(percent(share) if share else "" for share in shares)])
-    return [
-        Text("Options in tasks", "heading"),
-        Table(["Option", *(task or "no task" for task in tasks)], rows),
-    ]
+    head = ["Option", *(task or "no task" for task in tasks)]
+    return [Text("Options in tasks", "heading"), Table(head, rows)]
 
 
 def anchor(name: str) -> str:
@@ -107,11 +104,8 @@ def timelines(
     lanes: dict[str, tuple[Any, Any]] = {}  # the names and the colours of values
     for name, count in reversed(segmented.counts.items()):
         names = [option_name(choice, segmented.names.get(name, ())) for choice in range(count + 1)]
-        known = (
-            dict(enumerate(names)) | {UNKNOWN: SOURCES[0]}
-            if name + SOURCE in segmented.label_names
-            else names
-        )
+        with_open = dict(enumerate(names)) | {UNKNOWN: SOURCES[0]}
+        known = with_open if name + SOURCE in segmented.label_names else names
         lanes[name] = known, list(map(option_colour, range(count + 1)))
     for name, words in _values(segmented).items():
         matched = segmented.matched.get(name, {}).items()

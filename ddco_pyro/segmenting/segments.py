@@ -108,13 +108,11 @@ class Segmented:
         return len(self.segments)
 
     def labelled(self, truth: str) -> dict[str, Sequence[Segments]]:
-        """The demonstrations that have these labels, by part in words: the held-out ones first, then the others."""
+        """The demonstrations that have these labels, by part in words: held-out ones first, then others."""
         labelled = [demo for demo in self.segments if truth in demo.labels]
         held_out, others = ([demo for demo in labelled if demo.held_out is held] for held in (True, False))
-        parts = {
-            f"{len(held_out)} held out": held_out,
-            f"{len(others)} {'others' if held_out else 'in all'}": others,
-        }
+        rest = f"{len(others)} {'others' if held_out else 'in all'}"
+        parts = {f"{len(held_out)} held out": held_out, rest: others}
         return {part: group for part, group in parts.items() if group}
 
     @cached_property
@@ -126,10 +124,8 @@ class Segmented:
         agreements: dict[str, dict[str, Scores | None]] = {}
         for level, truth in self.truth.items():
             for part, group in self.labelled(truth).items():
-                options, labels = (
-                    [demo.levels[level].options for demo in group],
-                    [demo.labels[truth] for demo in group],
-                )
+                options = [demo.levels[level].options for demo in group]
+                labels = [demo.labels[truth] for demo in group]
                 scores = agreements.setdefault(level, {})
                 tasks = [demo.task for demo in group]
                 scores[f"options, {part}"] = scores_of(options, labels, tasks)
@@ -153,8 +149,7 @@ def segment(fit: Fit, path: str | Path) -> Segmented:
 
 
 def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bool = False) -> Segmented:
-    """The segments of every demonstration of a source, except those that the run's spec excludes from its
-    file.
+    """The segments of a source's demonstrations, except those that the run's spec excludes from its file.
 
     :param intervals: with the intervals of their boundaries.
     :raises BadInput: the run has no options.
@@ -171,26 +166,21 @@ def segments(fit: Fit, source: Source, on_event: OnEvent = ignore, intervals: bo
         before = 0  # steps whose labels are in memory
         for name in chosen:
             found = source.read(name)
-            seen = {
-                key: array for key, array in found.observations.items() if key in fit.hierarchy.encoder.shapes
-            }
+            shapes = fit.hierarchy.encoder.shapes
+            seen = {key: array for key, array in found.observations.items() if key in shapes}
             inferred = INFERENCE * len(found) + FOUND * fit.hierarchy.depth * (before + len(found))
             whole = needed([Demonstration.stored(name, seen, found.actions)]) + inferred
             refuse_too_much(whole, f"{name}: segmenting its {len(found)} steps", "divide it, or the file")
-            labels[name] = {
-                key: values
-                for key, values in found.labels.items()
-                if values.dtype.kind in "iub" and values.ndim == 1
-            }
+            flat = {key: values for key, values in found.labels.items() if values.ndim == 1}
+            labels[name] = {key: values for key, values in flat.items() if values.dtype.kind in "iub"}
             demo = _demonstration(found, fit)
             compared[name] = traits(demo, demo.observations)
             before += len(demo)
             yield demo
 
     for piece in fit.infer(read()):
-        segmented += (
-            replace(one, task=compared[one.name].task) for one in of_piece(fit, piece, labels, intervals)
-        )
+        own = of_piece(fit, piece, labels, intervals)
+        segmented += (replace(one, task=compared[one.name].task) for one in own)
         on_event(Counted("segmenting", len(chosen), done=len(segmented)))
     each, known = of_tasks([demo.task for demo in segmented], [demo.labels for demo in segmented], known)
     segmented = [replace(demo, labels=own) for demo, own in zip(segmented, each, strict=True)]
@@ -253,16 +243,13 @@ def of_piece(
         steps_of = np.arange(steps)
         known = piece.intervals(row) if intervals else [None] * len(fit.names)
         every = zip(fit.spec.levels, piece.segmented(row), piece.posterior.u, known, strict=True)
-        each = {  # rounding can exceed 1
-            level.name: LevelLabels(
-                options, starts, np.minimum(u[row].numpy()[steps_of, options], 1.0), within
-            )
-            for level, (options, starts), u, within in every
-        }
+        each = dict[str, LevelLabels]()
+        for level, (options, starts), u, within in every:
+            probability = np.minimum(u[row].numpy()[steps_of, options], 1.0)  # rounding can exceed 1
+            each[level.name] = LevelLabels(options, starts, probability, within)
         value = float(piece.log_likelihood[row])
         if not math.isfinite(value):
-            raise DemonstrationsError(
-                f"{name}: its log-likelihood is {value}, so no options explain it; see its controls with ddco-pyro "
-                "inspect, and repair it or leave it out"
-            )
+            why = f"its log-likelihood is {value}, so no options explain it"
+            remedy = "see its controls with ddco-pyro inspect, and repair it or leave it out"
+            raise DemonstrationsError(f"{name}: {why}; {remedy}")
         yield Segments(name, each, value / steps, fit.was_held_out(name, value), labels[name])

@@ -151,7 +151,7 @@ def _may_be_group(data: h5py.Group, name: str) -> bool:
 
 
 def frequency_of(attributes: Mapping[str, Attribute]) -> float | None:
-    """Control steps per second, Hz, by the file's attributes or robomimic's environment, described in them."""
+    """Control steps per second, Hz, by the file's attributes or robomimic's environment described in them."""
     try:
         said = json.loads(str(attributes.get(ENVIRONMENT, "{}")))
         return rate(attributes) or rate({**said, **(said.get("env_kwargs") or {})})

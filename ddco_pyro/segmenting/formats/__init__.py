@@ -37,8 +37,7 @@ class Asked:
     :param source: the demonstrations.
     :param level: the level whose options are subtasks.
     :param annotator: who labelled; empty where no one did.
-    :param same_order: leave out demonstrations whose options follow another order than most, rather than
-        refuse.
+    :param same_order: leave out demonstrations whose options follow another order than most; else refuse.
     """
 
     option: str
@@ -60,20 +59,19 @@ class Asked:
         return [name_in_level(option, level, names) for option in range(len(names))]
 
     def runs(self, demo: Segments) -> list[Run]:
-        """The subtasks of a demonstration: its level's options, where the same option chosen anew stays one
-        run.
+        """The subtasks of a demonstration: its level's options; the same option chosen anew stays one run.
 
         There is none where a person left steps open.
         """
         return [run for run in demo.levels[self.level].runs(anew=False) if run[0] != UNKNOWN]
 
     def said_by(self, demo: Segments, start: int, stop: int) -> str | None:
-        """Who says what steps are, one of :data:`~ddco_pyro.data.labels.SOURCES`; None where no person labelled."""
+        """Who says what steps are, of :data:`~ddco_pyro.data.labels.SOURCES`; None if no person labelled."""
         known = demo.sources.get(self.level + SOURCE)
         return None if known is None else SOURCES[known[start:stop].min()]
 
     def order(self, segmented: Segmented) -> list[int]:
-        """The options that are active at all, by how far through a demonstration they are active on average."""
+        """The options that are ever active, by how far through a demonstration they are active on average."""
         places: dict[int, list[float]] = {}
         for demo in segmented.segments:
             options = demo.levels[self.level].options
@@ -88,8 +86,7 @@ class Format(NamedTuple):
 
     :param write: its function in this package, ``module:function``.
     :param text: what is written, in words.
-    :param takes: the format of demonstrations that it copies, which ``check`` of its module looks at; empty
-        where it takes any.
+    :param takes: the format of demonstrations that it copies, which its module's ``check`` sees; empty: any.
     :param extra: of this project, where the format needs a package: a key of :data:`PACKAGES`.
     """
 
@@ -138,8 +135,7 @@ def format_of(option: str) -> Format:
 def check_format(asked: Asked) -> None:
     """Check, before anything is segmented, that a format can be written.
 
-    :raises BadInput: the format copies other demonstrations, its place is taken, or a package that it needs
-        is missing.
+    :raises BadInput: the format copies other demonstrations, its place is taken, or its package is missing.
     """
     form = format_of(asked.option)
     if form.takes not in ("", asked.source.format):
@@ -159,9 +155,8 @@ def check_copy(form: str, out: Path, path: Path) -> None:
     """
     module = "labels" if form == "robomimic" else "lerobot"
     if out.exists() and not resolve_name(f"{__name__}.{module}:is_copy")(out, path):
-        raise BadInput(
-            f"--out {out}: exists and is not a labelled copy of {path}; choose another --out, or remove it"
-        )
+        exists = f"exists and is not a labelled copy of {path}"
+        raise BadInput(f"--out {out}: {exists}; choose another --out, or remove it")
 
 
 def write_format(asked: Asked, segmented: Segmented) -> str:

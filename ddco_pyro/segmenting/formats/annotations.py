@@ -58,9 +58,8 @@ def _tiers(asked: Asked, demo: Segments) -> dict[str, list[tuple[str, int, int]]
     }
     if asked.level + SOURCE in demo.sources:
         runs = asked.runs(demo)
-        tiers[asked.level + SOURCE] = [
-            (str(asked.said_by(demo, start, stop)), start, stop) for _, start, stop in runs
-        ]
+        said = [(str(asked.said_by(demo, start, stop)), start, stop) for _, start, stop in runs]
+        tiers[asked.level + SOURCE] = said
     return tiers
 
 
@@ -116,8 +115,7 @@ def _task(asked: Asked, demo: Segments) -> dict[str, Any]:
 
 
 def write_rerun(asked: Asked, segmented: Segmented) -> str:
-    """A folder with ``<demonstration>.rrd``, over the timeline ``step``, and ``time`` where the frequency is
-    known.
+    """A folder with ``<demonstration>.rrd``, over the timeline ``step``, and ``time`` if the rate is known.
 
     ``segments/<level>`` has a ``StateChange`` at the first step of each segment, a lane of the state
     timeline. Beside it are the posterior probability of the active option, the controls, and the
@@ -139,9 +137,8 @@ def _record(path: str, asked: Asked, demo: Segments, frequency: float | None) ->
     found, steps = asked.source.read(demo.name), np.arange(len(demo))
     stream = rerun.RecordingStream("ddco-pyro", recording_id=demo.name)
     lanes = blueprint.StateTimelineView(origin="segments", name="segments")
-    stream.save(
-        path, default_blueprint=blueprint.Blueprint(blueprint.Vertical(lanes, blueprint.TimeSeriesView()))
-    )
+    views = blueprint.Vertical(lanes, blueprint.TimeSeriesView())
+    stream.save(path, default_blueprint=blueprint.Blueprint(views))
 
     def log(entity: str, at: np.ndarray, columns: Any) -> None:
         times = [rerun.TimeColumn("step", sequence=at)]
@@ -149,10 +146,8 @@ def _record(path: str, asked: Asked, demo: Segments, frequency: float | None) ->
             times.append(rerun.TimeColumn("time", duration=at / frequency))
         stream.send_columns(entity, times, columns)
 
-    states = {
-        name: (level.options, [*asked.names_of(name), SOURCES[UNKNOWN + 1]])
-        for name, level in demo.levels.items()
-    }
+    levels = demo.levels.items()
+    states = {name: (level.options, [*asked.names_of(name), SOURCES[UNKNOWN + 1]]) for name, level in levels}
     states |= {name: (own, [*SOURCES]) for name, own in demo.sources.items()}
     for name, (values, words) in states.items():
         starts = np.flatnonzero(np.diff(values, prepend=-9))

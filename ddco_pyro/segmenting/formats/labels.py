@@ -49,8 +49,7 @@ def labels_of(demo: Segments) -> dict[str, np.ndarray]:
 def check(asked: Asked) -> None:
     """Check that the labels can be written into the file, or into a copy of it.
 
-    :raises BadInput: the copy's place is taken, or a demonstration has labels of that name from another
-        source.
+    :raises BadInput: the copy's place is taken, or a demonstration has labels of that name from elsewhere.
     """
     if not _same(asked.out, asked.source.path):
         check_copy("robomimic", asked.out, asked.source.path)
@@ -69,9 +68,9 @@ def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None
             group = file["data"][name].get("labels", {})
             for label in labels:
                 if label in group and group[label].attrs.get(OURS) != SIGNATURE:
+                    foreign = f"labels/{label} exists and was not written by ddco-pyro segment"
                     raise BadInput(
-                        f"{path}: {name}: labels/{label} exists and was not written by ddco-pyro segment; give the "
-                        "level another name in the run's spec"
+                        f"{path}: {name}: {foreign}; give the level another name in the run's spec"
                     )
 
 
@@ -106,9 +105,8 @@ def write(asked: Asked, segmented: Segmented) -> str:
                         file["data"][name].attrs[mark] = marks[mark]
             if segmented.marks:
                 file.pop(f"mask/{EXCLUDE}", None)
-                leave_out(
-                    file, left_out := [name for name, marks in segmented.marks.items() if EXCLUDE in marks]
-                )
+                left_out = [name for name, marks in segmented.marks.items() if EXCLUDE in marks]
+                leave_out(file, left_out)
                 if left_out:
                     file[f"mask/{EXCLUDE}"] = np.array(left_out, "S")
             if (names := _names(segmented)) != label_names(attributes_of(file["data"]) | attributes_of(file)):
@@ -130,14 +128,11 @@ def leave_out(file: h5py.File, names: Collection[str]) -> None:
 
 
 def _names(segmented: Segmented) -> dict[str, list[str]]:
-    """The names of the labels in the file, where labels of a level with named options have the names of its choices."""
-    known = {
-        name: list(names) for name, names in segmented.label_names.items() if name not in segmented.counts
-    }
-    levels = segmented.names.items()
-    return known | {
-        level: list(names) for level, names in levels if tuple(names) != choice_names(len(names) - 1)
-    }
+    """The names of the labels in the file; those of a level with named options are named like its choices."""
+    labels, levels = segmented.label_names.items(), segmented.names.items()
+    known = {name: list(names) for name, names in labels if name not in segmented.counts}
+    own = {level: list(names) for level, names in levels if tuple(names) != choice_names(len(names) - 1)}
+    return known | own
 
 
 def _same(out: Path, path: Path) -> bool:

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ PEOPLE = {
     WHO: {"dtype": "int64", "shape": [1], "names": list(SOURCES)},
     WHOSE: {"dtype": "string", "shape": [1], "names": None},
 }
-"""The entries of further columns where a person labelled: who says what a frame's subtask is, and the annotator."""
+"""Further columns' entries where a person labelled: who says what a frame's subtask is, and the annotator."""
 
 COPIED = "copied_from"
 """In ``meta/lerobot_annotations.json`` of a labelled copy: the dataset that was copied."""
@@ -70,20 +71,13 @@ def _copied(asked: Asked, segmented: Segmented) -> Iterator[tuple[LeRobot, dict[
     """
     with whole_folder(asked.out) as temporary:
         folder = LeRobot(asked.source.path).folder
-        shutil.copytree(
-            folder,
-            temporary,
-            ignore=_loops,
-            copy_function=_link,
-            ignore_dangling_symlinks=True,
-            dirs_exist_ok=True,
-        )
+        copy = partial(shutil.copytree, ignore=_loops, copy_function=_link)
+        copy(folder, temporary, ignore_dangling_symlinks=True, dirs_exist_ok=True)
         yield LeRobot(temporary), {int(demo.name.removeprefix("demo_")): demo for demo in segmented.segments}
 
 
 def write_subtasks(asked: Asked, segmented: Segmented) -> str:
-    """Each row holds all subtasks of its episode in ``language_persistent``, as LeRobot 0.6 and newer read
-    them.
+    """Each row holds all subtasks of its episode in ``language_persistent``, as LeRobot from 0.6 on reads it.
 
     A subtask lasts from its ``timestamp``, the time of its first frame, to the next one; an entry without
     ``content`` is a gap. The page on which LeRobot's users label datasets keeps the same in
@@ -103,15 +97,12 @@ def write_subtasks(asked: Asked, segmented: Segmented) -> str:
                 rows = rows.drop_columns([SUBTASK] if SUBTASK in rows.column_names else [])
                 writer = writer or parquet.ParquetWriter(file, rows.schema)
                 writer.write_table(rows)
-                features = {
-                    name: about for name, about in {**FEATURES, **PEOPLE}.items() if name in rows.column_names
-                }
+                possible = {**FEATURES, **PEOPLE}.items()
+                features = {name: about for name, about in possible if name in rows.column_names}
                 atoms = [atom for atom in rows[PERSISTENT][0].as_py() if atom["style"] == "subtask"]
                 marks = segmented.marks.get(subtasks[episode].name, {})
-                episodes[str(episode)] = {
-                    "atoms": [{key: atom[key] for key in ATOM} for atom in atoms],
-                    **marks,
-                }
+                atoms = [{key: atom[key] for key in ATOM} for atom in atoms]
+                episodes[str(episode)] = {"atoms": atoms, **marks}
             assert writer is not None  # a file of a dataset holds an episode
             writer.close()
         origin = _origin(dataset.folder) or str(asked.source.path.resolve())
@@ -167,11 +158,8 @@ def _columns(asked: Asked, rows: pyarrow.Table, demo: Segments) -> dict[str, Any
         entries.sort(key=lambda entry: float(entry["timestamp"]))
     count, steps = len(entries), len(rows)
     on_each_row = pyarrow.array(entries, kind).take(pyarrow.array(np.tile(np.arange(count), steps)))
-    columns = {
-        PERSISTENT: pyarrow.ListArray.from_arrays(
-            pyarrow.array(np.arange(steps + 1) * count, "int32"), on_each_row
-        )
-    }
+    offsets = pyarrow.array(np.arange(steps + 1) * count, "int32")
+    columns = {PERSISTENT: pyarrow.ListArray.from_arrays(offsets, on_each_row)}
     if EVENTS not in rows.column_names:
         events = pyarrow.struct([kind.field(name) for name in (*fields, "tool_calls") if name != "timestamp"])
         columns[EVENTS] = pyarrow.array([[]] * steps, pyarrow.list_(events))
@@ -197,18 +185,15 @@ def write_stages(asked: Asked, segmented: Segmented) -> str:
                 "start_frames": [[start for _, start, _ in each] for each in runs],
                 "end_frames": [[stop - 1 for _, _, stop in each] for each in runs],
             }
-            table = _with(
-                table, {f"dense_subtask_{name}": pyarrow.array(values) for name, values in columns.items()}
-            )
-            known = {
-                key: value for key, value in (table.schema.metadata or {}).items() if key != b"huggingface"
-            }
+            dense = {f"dense_subtask_{name}": pyarrow.array(values) for name, values in columns.items()}
+            table = _with(table, dense)
+            metadata = (table.schema.metadata or {}).items()
+            known = {key: value for key, value in metadata if key != b"huggingface"}
             file.unlink()  # it may be a link
             parquet.write_table(table.replace_schema_metadata(known), file)
         every = [demo.levels[asked.level].options for demo in segmented.segments]
-        shares = {
-            option: np.mean([np.mean(each == option) for each in every]) for option in asked.order(segmented)
-        }
+        order = asked.order(segmented)
+        shares = {option: np.mean([np.mean(each == option) for each in every]) for option in order}
         proportions = {asked.names[option]: float(share) for option, share in shares.items()}
         path = dataset.folder / "meta" / "temporal_proportions_dense.json"
         write_text(path, json.dumps(proportions, indent=2, ensure_ascii=False) + "\n")

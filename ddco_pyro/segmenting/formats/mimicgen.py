@@ -1,4 +1,4 @@
-"""Ends of subtasks for MimicGen and Isaac Lab Mimic, in a copy of a file that their own scripts have prepared."""
+"""Ends of subtasks for MimicGen and Isaac Lab Mimic, in a copy of a file that their own scripts prepared."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ TOOLS = {
     "--isaac": Tool(
         "obs/datagen_info",
         ("eef_pose", "object_pose", "target_eef_pose"),
-        "scripts/imitation_learning/isaaclab_mimic/annotate_demos.py --auto --input_file {} --output_file PREPARED",
+        "scripts/imitation_learning/isaaclab_mimic/annotate_demos.py --auto --input_file {} "
+        "--output_file PREPARED",
     ),
 }
 
@@ -53,10 +54,9 @@ def check(asked: Asked) -> None:
         for name in chosen_names(asked.source, asked.fit):
             there = file[f"data/{name}"].get(tool.place, {})
             if missing := [key for key in tool.prepared if key not in there]:
-                raise BadInput(
-                    f"{asked.source.path}: {name}: has no {tool.place}/{missing[0]}, so the file is not prepared for "
-                    f"{asked.option}; first: {tool.script.format(asked.source.path)}"
-                )
+                path, lacks = asked.source.path, f"has no {tool.place}/{missing[0]}"
+                script = f"the file is not prepared for {asked.option}; first: {tool.script.format(path)}"
+                raise BadInput(f"{path}: {name}: {lacks}, so {script}")
 
 
 def write(asked: Asked, segmented: Segmented) -> str:
@@ -104,14 +104,13 @@ def _one_order(asked: Asked, segmented: Segmented) -> tuple[list[str], dict[str,
         elif each[0][2] == 1:
             problems[name] = f"its first subtask, {common[0]}, lasts one step, whose end cannot be marked"
     if len(common) == 1:
-        raise BadInput(
-            f"{asked.option}: most demonstrations have one subtask, {common[0]}: there is no end to mark"
-        )
+        single = f"most demonstrations have one subtask, {common[0]}"
+        raise BadInput(f"{asked.option}: {single}: there is no end to mark")
     if problems and not (asked.same_order and len(problems) < len(runs)):
         name, problem = next(iter(problems.items()))
+        share = f"({len(problems)} of {len(runs)})"
         raise BadInput(
-            f"{asked.option}: {name}: {problem}; --same-order leaves such demonstrations out ({len(problems)} of "
-            f"{len(runs)})"
+            f"{asked.option}: {name}: {problem}; --same-order leaves such demonstrations out {share}"
         )
     names = [
         f"{name}_{common[:place].count(name) + 1}" if name in common[:place] else name

@@ -1,4 +1,4 @@
-"""Tables with a row for each step, in CSV and Parquet, and a page with the time line of every demonstration."""
+"""Tables with a row for each step, in CSV and Parquet, and a page with each demonstration's time line."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def table(segmented: Segmented) -> pandas.DataFrame:
-    """A row for each step: of each level the option, whether it is a new choice, its probability and its
-    name.
+    """A row for each step: of each level the option, whether it is a new choice, its probability and name.
 
     Then comes who says so, where a person labelled.
     """
