@@ -1,4 +1,4 @@
-"""What restarts are trained on, and the training state of one restart, in memory and as a file (a checkpoint)."""
+"""What restarts are trained on, and the training state of one restart, in memory and as a checkpoint file."""
 
 from __future__ import annotations
 
@@ -144,11 +144,8 @@ class Restart:
     def written(self, path: Path | None) -> Restart:
         """This restart, written as a checkpoint where there is a path: whole or not at all."""
         if path is not None:
-            tensors = {
-                f"{part}/{name}": value
-                for part, state in self.states.items()
-                for name, value in state.items()
-            }
+            named = ((part, *item) for part, state in self.states.items() for item in state.items())
+            tensors = {f"{part}/{name}": value for part, name, value in named}
             write_tensors(path, tensors, {"progress": json.dumps(asdict(self.progress))})
         return self
 
@@ -168,9 +165,8 @@ class Restart:
 
 def fitted_of(model: Hierarchy) -> State:
     """What of a hierarchy is fitted before it is trained: its encoder and its scaling."""
-    return {
-        name: value for name, value in model.state_dict().items() if name.startswith(("encoder.", "scaling."))
-    }
+    fitted = ("encoder.", "scaling.")
+    return {name: value for name, value in model.state_dict().items() if name.startswith(fitted)}
 
 
 def copy_of(model: nn.Module) -> State:

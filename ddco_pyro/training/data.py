@@ -103,9 +103,8 @@ def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
         if why := network_input(observed.shape[1:], observed.dtype)[1]:
             raise DemonstrationsError(f"obs/{key} {why}")
     training = spec.training
-    needs_no_tuning = training.library is not None or (
-        training.optimizer.name == "em" and not spec.compare_with
-    )
+    em_alone = training.optimizer.name == "em" and not spec.compare_with
+    needs_no_tuning = training.library is not None or em_alone
     if training.tune_fraction > 0 or not needs_no_tuning:  # or one is enough
         check_trained(train_and_valid(spec, demos)["train"].names)
 
@@ -153,14 +152,11 @@ def _read(spec: Spec, path: Path, ready: Callable[[Demonstration], Demonstration
     :raises DemonstrationsError: the file is missing or damaged, or a fit to it does not fit into memory.
     """
     if not path.exists():
-        read = [
-            "actions",
-            *(f"obs/{key}" for key in spec.observed),
-            *(f"labels/{name}" for name in _labels(spec)),
-        ]
+        keys = [f"obs/{key}" for key in spec.observed]
+        read = ", ".join(["actions", *keys, *(f"labels/{name}" for name in _labels(spec))])
         raise DemonstrationsError(
             f"demonstrations.path: {path}: there is no such file; put it there, or fit to another with --set "
-            f"demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with {', '.join(read)} in each "
+            f"demonstrations.path=FILE; it has to be HDF5 in robomimic's layout, with {read} in each "
             "data/<demonstration>"
         )
     sought = spec.demonstrations
@@ -203,10 +199,8 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
     for kind, names, there in (("obs", keys, first.observations), ("labels", labels, first.labels)):
         for name in names:
             if name not in there:
-                known = ", ".join(there) or "nothing"
-                raise DemonstrationsError(
-                    f"there is no {kind}/{name}{nearest(name, there)}; there is: {known}"
-                )
+                missing = f"there is no {kind}/{name}{nearest(name, there)}"
+                raise DemonstrationsError(f"{missing}; there is: {', '.join(there) or 'nothing'}")
     if exclude:
         demos.select(exclude)  # or one of them is not there
     kept = tuple(
@@ -218,9 +212,7 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
         for demo in demos
         if demo.name not in exclude
     )
-    masks = {
-        mask: tuple(name for name in names if name not in exclude) for mask, names in demos.masks.items()
-    }
+    masks = {mask: tuple(name for name in own if name not in exclude) for mask, own in demos.masks.items()}
     return _set_apart(spec, replace(demos, demonstrations=kept, masks=masks))
 
 

@@ -117,7 +117,7 @@ def most_rows(numbers: int) -> int:
 
 
 def joined(seen: Tensor, actions: Tensor) -> Tensor:
-    """Observations [..., F] and controls [..., A], standardised, as [..., F + A] with equal weight on either."""
+    """Observations [..., F] and controls [..., A], standardised, as [..., F + A] with equal weights."""
     return torch.cat([seen, (seen.shape[-1] / actions.shape[-1]) ** 0.5 * actions], dim=-1)
 
 
@@ -168,7 +168,7 @@ WAYS: Mapping[Start | Literal["library"], Way] = {
 
 
 class _Start:
-    """Initial centres of k-means: the means of labelled options, then rows far from them (as k-means++ draws them)."""
+    """Initial centres of k-means: means of labelled options, then rows far from them (as k-means++ draws)."""
 
     def __init__(self, labels: np.ndarray) -> None:
         self.labels = labels
@@ -206,7 +206,7 @@ RAISED = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 FOLDS = 5
 """The parts into which training demonstrations are divided, each left out in turn."""
 GAIN = 0.5
-"""Nats per step: a ridge is large enough where no other gains more. Larger ones give policies that act worse."""
+"""Nats per step: a ridge is large enough where no other gains more. Larger ones make policies act worse."""
 LEAST = 0.01
 """σ of a policy, at least, in units of each dimension's spread."""
 
@@ -221,9 +221,8 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
     :param ridge: the spec's own.
     """
     scaling = model.scaling
-    dims = [
-        dim for own, part in zip(scaling.groups, scaling.parts, strict=True) if part.continuous for dim in own
-    ]
+    scaled = zip(scaling.groups, scaling.parts, strict=True)
+    dims = [dim for own, part in scaled if part.continuous for dim in own]
     (policy, *_), count = model.networks().values(), model.option_levels()[0].count if model.depth else 1
     assert isinstance(policy, Mlp)  # EM trains no other
     if len(batch) < 2 or not dims or not ridge or not policy.reads:
@@ -248,7 +247,7 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
 
 
 def _score(x: Tensor, actions: Tensor, others: Tensor, their: Tensor, ridges: Tensor) -> Tensor:
-    """The log-likelihood of left-out controls under regressions with each of R ridges, up to a constant, [R] nats."""
+    """The log-likelihood of left-out controls by regressions with R ridges, up to a constant, [R] nats."""
     prior = ridges.unsqueeze(-1).repeat(1, x.shape[-1])
     prior[:, -1] = BIAS
     weight = torch.linalg.solve(x.T @ x + torch.diag_embed(prior), x.T @ actions)  # [R, F, A]

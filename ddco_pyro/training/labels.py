@@ -47,16 +47,15 @@ class Labels:
         labels = spec.training.labels
         if labels is None or spec.hierarchy is None:
             return None
-        number, level = next(
-            item for item in enumerate(spec.hierarchy.levels, 1) if item[1].name == labels.level
-        )
+        levels = enumerate(spec.hierarchy.levels, 1)
+        number, level = next(item for item in levels if item[1].name == labels.level)
         each = (*train, *(() if tune is train else tune))
         used = [demo for demo in each if (demo.labels[labels.source] >= 0).any()]
         values = _distinct(demo.labels[labels.source] for demo in used)
         if not _distinct(demo.labels[labels.source] for demo in train):
             raise SpecError(
-                f"training.labels: labels/{labels.source} is -1 at every step of the demonstrations to train with; "
-                "leave training.labels out"
+                f"training.labels: labels/{labels.source} is -1 at every step of the demonstrations to train "
+                "with; leave training.labels out"
             )
         if len(values) > level.count:
             raise SpecError(
@@ -76,12 +75,8 @@ def used(spec: Spec, demos: Demonstrations) -> Labels | None:
     """
     if spec.training.labels is None:
         return None
-    return Labels.of(
-        spec,
-        *tuning_split(
-            spec, Dimensions.of(demos, spec.control.relative_to), train_and_valid(spec, demos)["train"]
-        ),
-    )
+    train = train_and_valid(spec, demos)["train"]
+    return Labels.of(spec, *tuning_split(spec, Dimensions.of(demos, spec.control.relative_to), train))
 
 
 def _distinct(labels: Iterable[np.ndarray]) -> tuple[int, ...]:

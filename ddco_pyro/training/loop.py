@@ -95,9 +95,8 @@ def train(
                     now.objective = stage.reached()
                     if until is not None:
                         now.sounded = now.objective
-                now.stage, now.epoch, now.done = (
-                    (now.stage, now.epoch, True) if last else (now.stage + 1, 0, False)
-                )
+                after = (now.stage, now.epoch, True) if last else (now.stage + 1, 0, False)
+                now.stage, now.epoch, now.done = after
             restart.states = {"best": states["best"]}
         except Diverged as error:
             now.done, now.diverged, restart.states = True, str(error), {}
@@ -123,13 +122,8 @@ class StageTraining:
     def __init__(
         self, data: TrainingData, model: Hierarchy, stage: Stage, restart: Restart, last: bool
     ) -> None:
-        self.data, self.model, self.stage, self.restart, self.ranks = (
-            data,
-            model,
-            stage,
-            restart,
-            Ranks.here(),
-        )
+        self.data, self.model, self.stage = data, model, stage
+        self.restart, self.ranks = restart, Ranks.here()
         self.spec, self.last, now = data.spec.training, last, restart.progress
         if stage.memoryless:
             model.begin_terminations()
@@ -138,10 +132,8 @@ class StageTraining:
         self.whole: Expectation | QuasiNewton | None = None
         optimizer = optimizer_of(self.spec.optimizer, model)
         if optimizer == "em":
-            ridge, discovering = self.spec.optimizer.ridge, stage.discovering
-            self.whole = Expectation(
-                model, stage.trained, self._score, ridge, discovering, not last, data.library
-            )
+            settings = (self.spec.optimizer.ridge, stage.discovering, not last, data.library)
+            self.whole = Expectation(model, stage.trained, self._score, *settings)
         elif optimizer == "lbfgs":
             gradient = partial(backward, self.objective)
             self.whole = QuasiNewton(model, gradient, self.spec.optimizer.weight_decay)
@@ -246,20 +238,13 @@ class StageTraining:
         """:func:`backward`, shard after shard; the processes take turns in computing them."""
         steps, at, total = int(batch.lengths[rows].sum()), self.restart.progress, 0.0
         sums: Gradients = [None] * len(self.parameters)
-        seeds = (
-            self.data.seed(at.restart, at.stage, at.epoch, number, shard) for shard in range(self.spec.shards)
-        )
-        shards = zip(
-            rows.tensor_split(min(self.spec.shards, len(rows))), seeds, strict=False
-        )  # none is empty
-        for value, gradients in self.ranks.each(
-            partial(self._shard, batch, *shard, steps) for shard in shards
-        ):
+        seed = partial(self.data.seed, at.restart, at.stage, at.epoch, number)
+        parts = rows.tensor_split(min(self.spec.shards, len(rows)))  # none is empty
+        shards = (partial(self._shard, batch, part, seed(shard), steps) for shard, part in enumerate(parts))
+        for value, gradients in self.ranks.each(shards):
             total += value
             pairs = zip(sums, gradients, strict=True)
-            sums = [
-                before if now is None else now if before is None else before + now for before, now in pairs
-            ]
+            sums = [old if new is None else new if old is None else old + new for old, new in pairs]
         for parameter, gradient in zip(self.parameters, sums, strict=True):
             parameter.grad = None if gradient is None else torch.from_numpy(gradient).to(parameter.device)
         return total
@@ -283,20 +268,17 @@ class StageTraining:
         """The objective of the training demonstrations under the best epoch's model, with the log-prior of
         the ridges where EM trains it, nats per step.
         """
-        train, model = (
-            self.data.train,
-            self.data.hierarchy(self.restart.progress.restart, self.restart.states["best"]),
-        )
+        train, restart = self.data.train, self.restart
+        model = self.data.hierarchy(restart.progress.restart, restart.states["best"])
         if isinstance(self.whole, Expectation):
             ridge, library = self.spec.optimizer.ridge, self.data.library
             score = Expectation(model, EVERYTHING, self._score, ridge, prior=library).objective(train)
         else:
             with torch.no_grad():
-                pieces = train.pieces(model.steps_at_once)
-                tables = (
-                    (self.objective.tables(model, piece, rows), piece.lengths) for rows, piece in pieces
-                )
-                score = sum(float(self.objective.values(*pair).sum()) for pair in tables)
+                score = 0.0
+                for rows, piece in train.pieces(model.steps_at_once):
+                    tables = self.objective.tables(model, piece, rows)
+                    score += float(self.objective.values(tables, piece.lengths).sum())
                 score += 0.0 if self.data.library is None else float(self.data.library.log_density(model))
         return score / train.steps
 

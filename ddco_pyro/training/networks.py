@@ -48,21 +48,21 @@ def _refuse_undrawable(spec: Spec, shapes: Shapes) -> None:
         counts.append(len(path.among(shape[0])) if len(shape) == 1 else 0)
         if counts[-1] not in (2, 3):
             raise SpecError(
-                f"report.trajectory: {str(path)!r} is {counts[-1]} numbers, of shape {list(shape)} at each step; name "
-                "two or three numbers of a vector, such as [KEY, 0:3]"
+                f"report.trajectory: {str(path)!r} is {counts[-1]} numbers, of shape {list(shape)} at each "
+                "step; name two or three numbers of a vector, such as [KEY, 0:3]"
             )
     if len(set(counts)) > 1:
         raise SpecError(
-            f"report.trajectory: {drawn[counts.index(2)]} is in the plane, {drawn[counts.index(3)]} in space; name "
-            "as many numbers of each"
+            f"report.trajectory: {drawn[counts.index(2)]} is in the plane, {drawn[counts.index(3)]} in "
+            "space; name as many numbers of each"
         )
 
 
 MOST_PARAMETERS = 50_000_000
-"""Of all networks together. Training holds each five times: weights, gradient, Adam's moments, the best so far."""
+"""Of all networks together; each is held five times: weights, gradient, Adam's moments, the best so far."""
 
 MOST_CHOICES = 10_000
-"""Joint choices of all levels, Π(1 + k): the inference has so many entries for every step of a demonstration."""
+"""Joint choices of all levels, Π(1 + k): inference has so many entries for every step of a demonstration."""
 
 
 def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
@@ -76,8 +76,8 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
     choices = math.prod(1 + level.count for level in spec.levels)
     if choices > MOST_CHOICES:
         raise SpecError(
-            f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be summed over; "
-            "lower count"
+            f"hierarchy.levels: the levels have {choices} joint choices, at most {MOST_CHOICES} can be "
+            "summed over; lower count"
         )
     device_of(spec.training)
     if any(place.endswith(".network") for place in user_code(spec)):
@@ -91,9 +91,8 @@ def check_networks(spec: Spec, dimensions: Dimensions) -> Hierarchy:
         if parameters(hierarchy) <= MOST_PARAMETERS:
             return hierarchy
         size = f"{parameters(hierarchy)} parameters, more than {MOST_PARAMETERS}"
-    raise SpecError(
-        f"the networks have {size}; lower count, hidden, filters or kernel, or scale the images down"
-    )
+    remedy = "lower count, hidden, filters or kernel, or scale the images down"
+    raise SpecError(f"the networks have {size}; {remedy}")
 
 
 def parameters(network: nn.Module) -> int:

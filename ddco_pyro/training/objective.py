@@ -32,7 +32,7 @@ class Diverged(TrainingError):
 
 
 Known = dict[int, Tensor]
-"""By level (1 is the lowest): the known choice of each step [N, T], -1 where it is free; or the evidence of choices."""
+"""By level (1 is lowest): each step's known choice [N, T], -1 where it is free; or evidence of choices."""
 
 
 class Objective:
@@ -80,7 +80,7 @@ class Objective:
         return {"known": known, "constants": self.constants.state() if self.constants else {}}
 
     def _clamp_to_start(self, level: int) -> None:
-        """A step without a label has its cluster, or the part of the demonstration it is in, as known choice."""
+        """A step without a label has its cluster, or its part of the demonstration, as known choice."""
         data, hierarchy = self.data, self.data.spec.hierarchy
         assert hierarchy is not None  # only levels are clamped
         restart = self.progress.restart
@@ -119,7 +119,7 @@ class Objective:
         return self.clamped(outputs.logits(batch.actions), rows, tuning)
 
     def clamped(self, tables: Tables, rows: Tensor, tuning: bool = False) -> Tables:
-        """The tables with known choices clamped, evidence of the others, and ψ = 1 in a stage that is memoryless."""
+        """The tables with known choices clamped, evidence of the others, and ψ = 1 in a memoryless stage."""
         if self.stage.memoryless:
             tables = tables.memoryless()
         for level, choices in self.known[tuning].items():
@@ -148,16 +148,14 @@ class Objective:
         """
         tune, training, prior = self.data.tune, self.data.spec.training, 0.0
         with torch.no_grad():
-            each = self.ranks.each(
-                partial(self._tuned, model, *piece) for piece in tune.pieces(model.steps_at_once)
-            )
+            pieces = tune.pieces(model.steps_at_once)
+            each = self.ranks.each(partial(self._tuned, model, *piece) for piece in pieces)
             values = list(chain.from_iterable(each))
             if self.data.library is not None and training.tune_fraction == 0:
                 prior = float(self.data.library.log_density(model)) / tune.steps
         if training.tune_by == "median":
-            return prior + median(
-                value / steps for value, steps in zip(values, tune.lengths.tolist(), strict=True)
-            )
+            pairs = zip(values, tune.lengths.tolist(), strict=True)
+            return prior + median(value / steps for value, steps in pairs)
         return prior + sum(values) / tune.steps
 
     def _tuned(self, model: Hierarchy, rows: Tensor, batch: Batch) -> list[float]:
@@ -167,10 +165,8 @@ class Objective:
     def diverged(self, tables: Tables, lengths: Tensor, rows: Tensor) -> Diverged:
         """The error that names the training demonstrations whose log-likelihood is not finite."""
         with torch.no_grad():
-            values = log_likelihood(tables, lengths)
-        bad = [
-            self.data.names[int(row)] for row, ok in zip(rows, torch.isfinite(values), strict=True) if not ok
-        ]
+            finite = torch.isfinite(log_likelihood(tables, lengths))
+        bad = [self.data.names[int(row)] for row, ok in zip(rows, finite, strict=True) if not ok]
         where = ", ".join(bad) or "this minibatch (no trajectory alone)"
         return Diverged(
             f"stage {self.stage.name}, epoch {self.progress.epoch + 1}: the log-likelihood of {where} is not "

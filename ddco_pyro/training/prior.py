@@ -27,7 +27,7 @@ from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
 
 Site = Callable[[str, TorchDistribution, Tensor, float], Tensor]
-"""What is done at a site: its name, distribution, present value, and how many times its log-density counts."""
+"""What is done at a site: name, distribution, present value, and how many times its log-density counts."""
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,8 @@ class Prior:
             squares = known.table().detach().double().expand(caller.copies, -1)[copies, places].square()
             half = 0.5 * self.spread * (caller.copies if key == "raw" else 1)
             precision = Gamma(torch.full_like(squares, half), half * squares)
-            of_log = TransformedDistribution(
-                precision, [ExpTransform().inv, AffineTransform(0.0, -0.5)]
-            ).to_event()
+            to_log = [ExpTransform().inv, AffineTransform(0.0, -0.5)]
+            of_log = TransformedDistribution(precision, to_log).to_event()
             drawn = site(f"{place}.log_{key}".replace(".", "_"), of_log, value.log(), power).exp()
             for column, own in zip(places, drawn.unbind(-1), strict=True):
                 columns[column] = own.expand(caller.copies)
@@ -118,9 +117,8 @@ class Prior:
         network, center = model.networks()[place], self.model.networks()[place]
         caller = model.named_callers().get(place)
         last = f"layers.{len(network.layers) - 1}."
-        for (name, value), (_, known) in zip(
-            network.named_parameters(), center.named_parameters(), strict=True
-        ):
+        pairs = zip(network.named_parameters(), center.named_parameters(), strict=True)
+        for (name, value), (_, known) in pairs:
             is_last = name.startswith(last)
             choices = value.shape[-1]
             if caller is not None and std is not None:

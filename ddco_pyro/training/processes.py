@@ -45,11 +45,9 @@ class Ranks:
     @classmethod
     def here(cls) -> Ranks:
         """This process among those that :func:`together` has connected; elsewhere a single process."""
-        return (
-            cls(distributed.get_rank(), distributed.get_world_size())
-            if distributed.is_initialized()
-            else cls()
-        )
+        if not distributed.is_initialized():
+            return cls()
+        return cls(distributed.get_rank(), distributed.get_world_size())
 
     def share(self, value: Any = None) -> Any:
         """The value that the first process gives, in each process.
@@ -154,8 +152,8 @@ def device_of(training: TrainingSpec) -> torch.device:
         return HOST
     if not torch.cuda.is_available():
         raise SpecError(
-            f"training.device: cuda: torch {torch.__version__} has no GPU here; say cpu, or auto for a GPU where there "
-            "is one"
+            f"training.device: cuda: torch {torch.__version__} has no GPU here; say cpu, or auto for a GPU "
+            "where there is one"
         )
     return torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
 

@@ -167,13 +167,8 @@ def _tried(
         for ridge in RIDGES:
             learn(windows, features[known > 0], known[known > 0], ridge)
             ratios[ridge] = windows.log_ratio(features)
-        begun = _begun(
-            data,
-            batch,
-            torch.where(known < 0, ratios[RIDGES[1]][..., 1:].argmax(-1) + 1, known),
-            known,
-            names,
-        )
+        starts = torch.where(known < 0, ratios[RIDGES[1]][..., 1:].argmax(-1) + 1, known)
+        begun = _begun(data, batch, starts, known, names)
         (rows,) = torch.where((hidden & (options > 0)).any(1))
         part, truth = batch.select(rows), torch.where(hidden, options, -1)[rows]
         for power, weight in PAIRS:
@@ -195,7 +190,7 @@ def _tried(
 
 
 def _left_out(options: Tensor, lengths: Tensor) -> Iterator[Tensor]:
-    """The steps that are left out together, bool [N, T]: of whole demonstrations, or parts of a single one."""
+    """Steps that are left out together, bool [N, T]: of whole demonstrations, or parts of a single one."""
     (labelled,) = torch.where((options > 0).any(1))
     fold = torch.full_like(options, -1)
     if len(labelled) == 1:

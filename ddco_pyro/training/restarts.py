@@ -186,8 +186,8 @@ class Trainer:
             outputs = self.hierarchy(few.inputs)
         if not all(bool(torch.isfinite(values).all()) for values in outputs.tensors()):
             raise TrainingError(
-                "before any training a network gives values that are NaN or infinite; look at its code, or at the "
-                "ranges of the observations (ddco-pyro inspect)"
+                "before any training a network gives values that are NaN or infinite; look at its code, or "
+                "at the ranges of the observations (ddco-pyro inspect)"
             )
         check = compare_engines(outputs, few.actions, few.lengths)
         if self.data.library is not None and self.data.library.ridge and self._optimizer == "em":
@@ -201,22 +201,19 @@ class Trainer:
             )
 
     def _prior_gap(self, library: Prior, batch: Batch) -> float:
-        """The relative difference between EM's log-prior and the program's; densities have constants of their own."""
+        """The relative difference between EM's log-prior and the program's; each has constants of its own."""
 
         def score(tables: Tables, piece: Batch, rows: torch.Tensor) -> torch.Tensor:
             return log_likelihood(tables, piece.lengths).sum()
 
-        models = (
-            self.hierarchy,
-            self.data.hierarchy(0, {**self.hierarchy.state_dict(), **copy_of(library.model)}),
-        )
+        of_library = {**self.hierarchy.state_dict(), **copy_of(library.model)}
+        models = (self.hierarchy, self.data.hierarchy(0, of_library))
         ridge = self.spec.training.optimizer.ridge
         by_em = [Expectation(one, EVERYTHING, score, ridge, prior=library).log_prior(batch) for one in models]
         with torch.no_grad():
             by_program = [float(library.log_density(one)) for one in models]
-        return abs(by_em[1] - by_em[0] - by_program[1] + by_program[0]) / max(
-            1.0, abs(by_program[1] - by_program[0])
-        )
+        scale = max(1.0, abs(by_program[1] - by_program[0]))
+        return abs(by_em[1] - by_em[0] - by_program[1] + by_program[0]) / scale
 
     def run(self) -> Hierarchy:
         """Train, and return the best restart's hierarchy in evaluation mode.
@@ -266,23 +263,19 @@ class Trainer:
         model = self.data.hierarchy(number)
         model.begin_terminations(logit)
         begun = Progress(number, stage=self._last(number), device=described(device_of(self.spec.training)))
-        self.restarts.append(
-            self._begun(number, Restart(begun, {"model": copy_of(model) | copy_of(mixture)}))
-        )
+        beginning = Restart(begun, {"model": copy_of(model) | copy_of(mixture)})
+        self.restarts.append(self._begun(number, beginning))
         with self._together():
             self._train([number])
 
     def _keep_best(self) -> Hierarchy:
         if len(self.restarts) > 1 and self.hierarchy.depth:
-            from sklearn.metrics import normalized_mutual_info_score
+            from sklearn.metrics import normalized_mutual_info_score as nmi
 
-            found = {
-                n: self._segments(n) for n, restart in enumerate(self.restarts) if "best" in restart.states
-            }
+            ended = [n for n, restart in enumerate(self.restarts) if "best" in restart.states]
+            found = {n: self._segments(n) for n in ended}
             own = found.pop(self.best)
-            self.agreement = {
-                n: float(normalized_mutual_info_score(own, other)) for n, other in found.items()
-            }
+            self.agreement = {n: float(nmi(own, other)) for n, other in found.items()}
         self.hierarchy.load_state_dict(self.restarts[self.best].states["best"])
         return self.hierarchy.place(device_of(self.spec.training)).eval()
 
@@ -333,7 +326,7 @@ class Trainer:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """``training`` of ``metrics.json``: the budget, the best restart's stages, and the epochs of all restarts."""
+        """``training`` of ``metrics.json``: budget, the best restart's stages, epochs of all restarts."""
         optimizer, best, kept = self._optimizer, self.best, self.restarts[self.best].progress
         updates = math.ceil(len(self.data.train) / self.spec.training.batch_size) if self._by_gradient else 1
         starts = [*starts_of(self.spec), BESIDE, BESIDE]
@@ -371,9 +364,8 @@ class Trainer:
         model = self.data.hierarchy(number, self.restarts[number].states["best"])
         with torch.no_grad():
             pieces = (piece for _, piece in self.data.train.pieces(model.steps_at_once))
-            found = [
-                segment(model.recognised(model.tabulate(piece), piece), piece.lengths)[0] for piece in pieces
-            ]
+            tables = ((model.recognised(model.tabulate(piece), piece), piece.lengths) for piece in pieces)
+            found = [segment(*own)[0] for own in tables]
         return torch.cat([choices[choices >= 0] for choices in found]).numpy()
 
     def _last(self, number: int) -> int:
@@ -392,8 +384,8 @@ class Trainer:
         begun = Restart.read(path)
         if begun.progress.device != device and not begun.progress.done:
             raise OtherDevice(
-                f"{path}: was trained on {begun.progress.device}, and networks are on {device} here, where the last "
-                "digits differ; continue it there, or remove it: this restart then begins anew"
+                f"{path}: was trained on {begun.progress.device}, and networks are on {device} here, where "
+                "the last digits differ; continue it there, or remove it: this restart then begins anew"
             )
         return begun
 

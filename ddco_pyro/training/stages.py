@@ -73,9 +73,8 @@ def plan(spec: Spec, depth: int, restart: int = 0) -> list[Stage]:
         networks = networks if level > 1 else ("trunk.", *networks)
         if way.stage:
             name = f"{way.stage}-{level}"
-            if (
-                level == depth and not layerwise and not acts
-            ):  # clamped choices do not show when it acts itself
+            # clamped choices do not show when it acts itself
+            if level == depth and not layerwise and not acts:
                 trained = (*networks, "meta_policy.")
                 stages.append(Stage(name, None, level, trained, selecting=True, memoryless=mixed))
             else:
@@ -109,15 +108,8 @@ def stage_end(
     epochs = len(tune) - 1
     over = min(patience or WINDOW, epochs)
     rising = 0.0 if at_optimum else max(tune) - max(tune[: epochs - over + 1])
-    converged = epochs > 0 and rising <= RISING
-    return {
-        "stage": stage,
-        "epochs": epochs,
-        "cap": cap,
-        "rising": rising,
-        "over": over,
-        "converged": converged,
-    }
+    end = {"stage": stage, "epochs": epochs, "cap": cap}
+    return {**end, "rising": rising, "over": over, "converged": epochs > 0 and rising <= RISING}
 
 
 def share(budget: int | None, spent: int, stages_left: int) -> int | None:

@@ -21,7 +21,7 @@ from ddco_pyro.inference import fused
 from ddco_pyro.model.tables import NEVER, Tables, always_ends
 
 STARTS = 16
-"""Random starts, halved again and again by likelihood. On planted levels about one in three reaches the best."""
+"""Random starts, halved again and again by likelihood. On planted levels about a third reaches the best."""
 
 FIRST = 10
 """Iterations before the first halving; each further halving comes after twice as many."""
@@ -73,11 +73,8 @@ class Constants:
     def state(self) -> dict[str, Tensor]:
         """The constants as tensors by name."""
         parts = {"selection": self.selection, "termination": self.termination}
-        return {
-            f"{kind}.{number:03}": table
-            for kind, tables in parts.items()
-            for number, table in enumerate(tables)
-        }
+        numbered = ((kind, *item) for kind, tables in parts.items() for item in enumerate(tables))
+        return {f"{kind}.{number:03}": table for kind, number, table in numbered}
 
     def within(self, tables: Tables) -> Tables:
         """The tables with these probabilities in place of the networks'; no caller emits the control."""
@@ -85,9 +82,8 @@ class Constants:
         for level, chosen in enumerate(self.selection):
             selection[level] = pad(chosen.log(), (1, 0), value=NEVER).expand(tables.selection[level].shape)
         for level, ended in enumerate(self.termination, start=1):
-            termination[level] = (
-                torch.stack([1 - ended, ended], -1).log().expand(tables.termination[level].shape)
-            )
+            ending = torch.stack([1 - ended, ended], -1).log()
+            termination[level] = ending.expand(tables.termination[level].shape)
         return replace(tables, selection=tuple(selection), termination=tuple(termination))
 
 
@@ -106,12 +102,10 @@ def fitted(pieces: Sequence[Piece], seed: int) -> Constants:
     return _run(pieces, left[0], MOST, CONVERGED * steps)[1]
 
 
-def _run(
-    pieces: Sequence[Piece], constants: Constants, iterations: int, least: float
-) -> tuple[float, Constants]:
+def _run(pieces: Sequence[Piece], constants: Constants, most: int, least: float) -> tuple[float, Constants]:
     """Iterate EM while an iteration gains ``least`` nats; the last log-likelihood, and the constants."""
     value = -np.inf
-    for _ in range(iterations):
+    for _ in range(most):
         before, (value, constants) = value, improved(pieces, constants)
         if value - before < least:
             break
@@ -122,9 +116,8 @@ def improved(pieces: Sequence[Piece], constants: Constants) -> tuple[float, Cons
     """An iteration of EM: the log-likelihood of the constants, and the next constants."""
     value = 0.0
     selected = [torch.full_like(table, PSEUDO) for table in constants.selection]
-    ended = [
-        torch.stack([PSEUDO * (psi < 1), torch.full_like(psi, PSEUDO)], -1) for psi in constants.termination
-    ]
+    ends = constants.termination
+    ended = [torch.stack([PSEUDO * (psi < 1), torch.full_like(psi, PSEUDO)], -1) for psi in ends]
     for tables, lengths in pieces:
         posterior = fused.posteriors(constants.within(tables), lengths)
         value += float(posterior.value.sum())
