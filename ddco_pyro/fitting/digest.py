@@ -1,4 +1,4 @@
-"""The digest of the demonstrations of a run, and the version of its folder's format: ``demonstrations.json``."""
+"""The digest of a run's demonstrations, and the version of its folder's format: ``demonstrations.json``."""
 
 from __future__ import annotations
 
@@ -45,11 +45,8 @@ class Digest(Record):
 
     def places(self) -> dict[str, Any]:
         """The digests by place in a file of demonstrations."""
-        kinds: dict[str, Mapping[str, Any]] = {
-            "obs": self.observations,
-            "labels": self.labels,
-            "mask": self.masks,
-        }
+        kinds: dict[str, Mapping[str, Any]] = {"obs": self.observations, "labels": self.labels}
+        kinds["mask"] = self.masks
         each = {f"{kind}/{key}": value for kind, values in kinds.items() for key, value in values.items()}
         return {"actions": self.controls} | each
 
@@ -62,9 +59,8 @@ def digest(demos: Demonstrations, known: Digest | None = None) -> Digest:
     """
     seen = {key: [demo.observations[key] for demo in demos] for key in sorted(demos[0].observations)}
     files = {key: found for key, arrays in seen.items() if (found := _file(arrays))}
-    unchanged = {
-        key for key in files if known and (known.names, known.files.get(key)) == ([*demos.names], files[key])
-    }
+    names = [*demos.names]
+    unchanged = {key for key in files if known and (known.names, known.files.get(key)) == (names, files[key])}
     return Digest(
         names=[*demos.names],
         format=FORMAT,
@@ -116,8 +112,8 @@ def recorded(folder: Path) -> Digest | None:
     kept = read_record(path, Digest, "fit again into another --out")
     if kept.format != FORMAT:
         raise BadInput(
-            f"{folder}: this run was written by version {kept.format} of the run folder's format, and version {FORMAT} "
-            "is read here: fit again"
+            f"{folder}: this run was written by version {kept.format} of the run folder's format, and "
+            f"version {FORMAT} is read here: fit again"
         )
     return kept
 
@@ -134,8 +130,8 @@ def record(folder: Path, demos: Demonstrations, known: Digest | None = None) -> 
         write_text(folder / NAME, digest(demos, known).model_dump_json(indent=1) + "\n")
     elif different := difference(kept, digest(demos, kept)):
         raise BadInput(
-            f"{folder}: is a run of other demonstrations ({different}); bring back those that it was fitted to, or "
-            "choose another --out for these"
+            f"{folder}: is a run of other demonstrations ({different}); bring back those that it was fitted "
+            "to, or choose another --out for these"
         )
 
 

@@ -107,12 +107,9 @@ class Draws:
         variables = {level: (dimensions, drawn) for level, drawn in self.options.items()}
         known = {key: coordinates[key] for key in ("chain", "demonstration", "training_seed")}
         likelihood = {"control": (("chain", "demonstration"), self.log_likelihood, {"units": "nats"})}
-        return xarray.DataTree.from_dict(
-            {
-                "posterior": xarray.Dataset(variables, coordinates),
-                "log_likelihood": xarray.Dataset(likelihood, known),
-            }
-        )
+        posterior = xarray.Dataset(variables, coordinates)
+        parts = {"posterior": posterior, "log_likelihood": xarray.Dataset(likelihood, known)}
+        return xarray.DataTree.from_dict(parts)
 
 
 def draw(

@@ -51,7 +51,8 @@ class OptionSegmenter(BaseEstimator):
     >>> model = ddco_pyro.OptionSegmenter(2, random_state=0).fit(X, U)
     >>> model.predict(X, U).shape, model.predict_proba(X, U).shape
     ((60,), (60, 2))
-    >>> bool(np.isclose(model.score(X, U), model.score(np.concatenate(X), np.concatenate(U), lengths=[10] * 6)))
+    >>> joined = np.concatenate(X), np.concatenate(U)
+    >>> bool(np.isclose(model.score(X, U), model.score(*joined, lengths=[10] * 6)))
     True
 
     :param n_options: k.
@@ -94,9 +95,8 @@ class OptionSegmenter(BaseEstimator):
         self.fit_ = fit(self.spec_, demos)
         if not self._has_controls:
             (piece,) = self.fit_.infer(demos[:1])
-            selection, termination = (
-                table[0].exp() for table in (piece.tables.selection, piece.tables.termination)
-            )
+            tables = piece.tables
+            selection, termination = (table[0].exp() for table in (tables.selection, tables.termination))
             self.startprob_ = selection[0, 0, 0, 1:].double().numpy()
             ending = termination[0, 0, :, 1:].double().numpy()
             self.transmat_ = np.diag(1 - ending[:, 0]) + ending * self.startprob_
@@ -137,11 +137,11 @@ class OptionSegmenter(BaseEstimator):
         :param X: the observations to which the controls react; for a fit without U, the number of steps.
         """
         check_is_fitted(self)
-        if not self._has_controls:
+        if self._has_controls:
+            observed = self._rows(X, None, lengths)[::2]
+        else:
             check_whole("X", X, 1)
-        observed = (
-            self._rows(X, None, lengths)[::2] if self._has_controls else (np.zeros((X, 1)), np.array([X]))
-        )
+            observed = np.zeros((X, 1)), np.array([X])
         first = _drawn(random_state)
         controller = Controller(self.fit_.hierarchy, "sample", "sample")
         controls, options = [], []
@@ -157,19 +157,16 @@ class OptionSegmenter(BaseEstimator):
         settings = {} if self.settings is None else self.settings
         if not isinstance(settings, Mapping) or not all(isinstance(path, str) for path in settings):
             raise BadInput(
-                f"settings={settings!r}: has to be a mapping of key paths, such as {{'training.layerwise': False}}"
+                f"settings={settings!r}: has to be a mapping of key paths, such as "
+                "{'training.layerwise': False}"
             )
         network = {"network": "linear"}
+        level = {"count": self.n_options, "policy": {"network": self.policy}, "termination": network}
         data = {
             "demonstrations": {"path": "arrays in memory", "valid_fraction": 0},
             "observations": [{"key": "x", "differences": self.differences and self._has_controls}],
             "control": {"kind": self.control, "std": {"learn": True, "per_option": True}},
-            "hierarchy": {
-                "levels": [
-                    {"count": self.n_options, "policy": {"network": self.policy}, "termination": network}
-                ],
-                "meta_policy": network,
-            },
+            "hierarchy": {"levels": [level], "meta_policy": network},
             "training": {
                 "starts": STARTS,
                 "optimizer": {"name": "em", "lr": 3e-3},
@@ -200,9 +197,8 @@ class OptionSegmenter(BaseEstimator):
         if controls is None:
             observed, controls = np.zeros((len(observed), 1)), observed
         pairs = zip(self._split(observed, steps), self._split(controls, steps), strict=True)
-        return Demonstrations(
-            tuple(Demonstration(f"sequence_{n}", {"x": x}, u) for n, (x, u) in enumerate(pairs))
-        )
+        demos = (Demonstration(f"sequence_{n}", {"x": x}, u) for n, (x, u) in enumerate(pairs))
+        return Demonstrations(tuple(demos))
 
     def _rows(
         self, X: Any, U: Any, lengths: Any, fitting: bool = False
@@ -222,9 +218,8 @@ class OptionSegmenter(BaseEstimator):
                 lengths = [len(rows) for rows in X]
                 for number, rows in enumerate(X):  # the names and the number of columns
                     validate_data(self, rows, reset=fitting and number == 0, skip_check_array=True)
-                X = check_array(
-                    np.concatenate([np.asarray(rows) for rows in X]), dtype=np.float64, input_name="X"
-                )
+                joined = np.concatenate([np.asarray(rows) for rows in X])
+                X = check_array(joined, dtype=np.float64, input_name="X")
                 if U is not None:
                     controls = [np.asarray(rows) for rows in U]
                     if [len(rows) for rows in controls] != lengths:
@@ -233,9 +228,8 @@ class OptionSegmenter(BaseEstimator):
                         self._check_controls(rows, fitting and number == 0)
                     U = np.concatenate([rows[:, None] if rows.ndim == 1 else rows for rows in controls])
             else:
-                X = validate_data(
-                    self, X, reset=fitting, dtype=np.float64, ensure_min_samples=2 if fitting else 1
-                )
+                fewest = 2 if fitting else 1
+                X = validate_data(self, X, reset=fitting, dtype=np.float64, ensure_min_samples=fewest)
                 self._check_controls(U, fitting)
             U = None if U is None else check_array(U, input_name="U")
         except BadInput:
@@ -255,9 +249,8 @@ class OptionSegmenter(BaseEstimator):
         if fitting:
             self._control_names = names
         elif names and self._control_names and names != self._control_names:
-            raise BadInput(
-                f"U has the columns {', '.join(names)}; the fit had {', '.join(self._control_names)}"
-            )
+            there = ", ".join(self._control_names)
+            raise BadInput(f"U has the columns {', '.join(names)}; the fit had {there}")
 
     @staticmethod
     def _split(rows: np.ndarray, lengths: np.ndarray) -> list[np.ndarray]:

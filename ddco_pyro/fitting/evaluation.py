@@ -1,4 +1,4 @@
-"""The evaluation of a fit: log-likelihoods, differences to baselines, use of options, agreement with labels."""
+"""Evaluation of a fit: log-likelihoods, differences to baselines, use of options, agreement with labels."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from ddco_pyro.metrics import (
     Agreement,
     Alike,
     Below,
+    ByDimension,
     Compared,
     Counts,
     Dimensions,
@@ -140,7 +141,7 @@ def _as_own(fit: Fit, demos: Demonstrations) -> Callable[[Inferred], tuple[Tenso
 
 
 def _active(pieces: Iterable[Inferred], sizes: Sequence[int]) -> dict[str, Tensor]:
-    """Whether each choice is active on the most likely path of each demonstration, by name, [T, Σ (1 + k_d)]."""
+    """Whether each choice is active on a demonstration's most likely path, by name, [T, Σ (1 + k_d)]."""
     return {
         name: torch.cat(
             [
@@ -162,16 +163,16 @@ def _finite(fit: Fit, piece: Inferred) -> np.ndarray:
     for name, value in zip(piece.names, piece.log_likelihood, strict=True):
         if not np.isfinite(value):
             raise Failed(
-                f"{fit.place}: the log-likelihood of {name} under the fitted model is {value}; look at its values "
-                "(ddco-pyro inspect), lower training.optimizer.lr, or leave it out (demonstrations.exclude)"
+                f"{fit.place}: the log-likelihood of {name} under the fitted model is {value}; look at its "
+                "values (ddco-pyro inspect), lower training.optimizer.lr, or leave it out "
+                "(demonstrations.exclude)"
             )
     return piece.log_likelihood
 
 
 def _versions() -> dict[str, str]:
-    installed = {
-        package: next(iter(importlib.metadata.distributions(name=package)), None) for package in PACKAGES
-    }
+    distributions = importlib.metadata.distributions
+    installed = {package: next(iter(distributions(name=package)), None) for package in PACKAGES}
     return {package: found.version for package, found in installed.items() if found}
 
 
@@ -222,9 +223,7 @@ def evaluate(
     return Metrics(
         model=fitted.name,
         log_likelihood_per_step=Parts[Finite](train=per_step["train"], valid=per_step.get("valid")),
-        log_likelihood_by_dimension=Parts[Dimensions](
-            train=by_dimension["train"], valid=by_dimension.get("valid")
-        ),
+        log_likelihood_by_dimension=ByDimension(train=by_dimension["train"], valid=by_dimension.get("valid")),
         valid=[
             HeldOut(name=demo.name, steps=len(demo), log_likelihood=float(value))
             for demo, value in zip(valid or (), values.get("valid", ()), strict=True)
@@ -293,27 +292,24 @@ def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Ma
     own = {"control.std": spec.control.std} | {
         f"control.parts.{n}.std": p.std for n, p in enumerate(spec.control.parts)
     }
+    said = {path: std for path, std in own.items() if std}
     stds = {
-        path: std if isinstance(std, LearnedStd) else LearnedStd(learn=True)
-        for path, std in own.items()
-        if std
+        path: std if isinstance(std, LearnedStd) else LearnedStd(learn=True) for path, std in said.items()
     }
     learned = {path: {"learn": True, "floor": std.floor} for path, std in stds.items()}
     unseen = partial(_unseen, relative_to=spec.control.relative_to)
     train = unseen(tuning_split(spec, size, parts["train"])[0])
     alike = replace(size, shapes=train.observation_shapes, steps=max(train.lengths))  # of the same kinds
     model = train_model(with_overrides(spec, {**CONSTANT, **learned}), alike, train).hierarchy
-    values = {
-        name: float(
-            sum(piece.log_likelihood.sum() for piece in infer(model, unseen(part))) / sum(part.lengths)
-        )
-        for name, part in parts.items()
-    }
+    values = {}
+    for name, part in parts.items():
+        total = sum(piece.log_likelihood.sum() for piece in infer(model, unseen(part)))
+        values[name] = float(total / sum(part.lengths))
     return Marginal(**values, controls=len(model.scaling.varying))
 
 
 def _unseen(demos: Demonstrations, relative_to: str | None) -> Demonstrations:
-    """Demonstrations with a constant in place of their observations, and with what options are of as their controls."""
+    """Demonstrations with a constant as their observations, and what options are of as their controls."""
     each = ((one, one.controls(relative_to)) for one in demos)
     nothing = (
         replace(one, observations={"nothing": np.zeros((len(one), 1))}, actions=own) for one, own in each
@@ -345,18 +341,11 @@ def _worst_first(
 
     The least likely demonstration under the method ``ours`` comes first.
     """
-    rows = [
-        Listed(
-            name=demo.name,
-            part=part,
-            steps=len(demo),
-            log_likelihood_per_step={
-                name: float(values[part][row]) / len(demo) for name, values in by_method.items()
-            },
-        )
-        for part, demos in parts.items()
-        for row, demo in enumerate(demos)
-    ]
+    rows = []
+    for part, demos in parts.items():
+        for row, demo in enumerate(demos):
+            nats = {name: float(values[part][row]) / len(demo) for name, values in by_method.items()}
+            rows.append(Listed(name=demo.name, part=part, steps=len(demo), log_likelihood_per_step=nats))
     return sorted(rows, key=lambda row: row.log_likelihood_per_step[ours])
 
 
@@ -385,10 +374,8 @@ def _agreement(fit: Fit, ours: Mapping[str, _Part], parts: Mapping[str, Demonstr
         truth, tasks = [[demo.labels[name] for demo in demos] for name in names], demos.tasks
         pairs = list(zip(ours[part].segments, truth, strict=False))
         equal = zip(truth, (level.count for level in levels), ours[part].segments, strict=False)
-        found |= {
-            part: [agreement(*pair, tasks) for pair in pairs],
-            "confusion": [confusion(*pair) for pair in pairs],
-        }
+        found[part] = [agreement(*pair, tasks) for pair in pairs]
+        found["confusion"] = [confusion(*pair) for pair in pairs]
         found[f"equal_{part}"] = [of_equal_lengths(*each, tasks) for each in equal]
         if names and recogniser is not None:
             found["recogniser"][part] = agreement(ours[part].recognised, truth[recogniser.level - 1], tasks)

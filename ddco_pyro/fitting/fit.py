@@ -56,7 +56,8 @@ def fit(
     >>> random = np.random.default_rng(0)
     >>> def demonstration(n):  # to the place, then away from it
     ...     place = random.normal(size=(10, 2))
-    ...     return ddco_pyro.Demonstration(f"demo_{n}", {"place": place}, place * np.repeat([[-2.0], [2.0]], 5, 0))
+    ...     controls = place * np.repeat([[-2.0], [2.0]], 5, 0)
+    ...     return ddco_pyro.Demonstration(f"demo_{n}", {"place": place}, controls)
     >>> demos = ddco_pyro.Demonstrations(tuple(demonstration(n) for n in range(6)))
     >>> fit = ddco_pyro.fit("mine.yaml", demos)
     >>> fit.metrics.demonstrations
@@ -84,15 +85,13 @@ def fit(
     :raises DemonstrationsError: the demonstrations cannot be used.
     :raises TrainingError: training stopped; the checkpoints stay.
     """
-    spec, folder = (
-        spec if isinstance(spec, Spec) else load_spec(spec),
-        None if out is None else path_of(out, "out"),
-    )
+    spec = spec if isinstance(spec, Spec) else load_spec(spec)
+    folder = None if out is None else path_of(out, "out")
     processes, shards = Ranks.here().size, spec.training.shards
     if processes > shards:
         raise BadInput(
-            f"torchrun started {processes} processes, but a minibatch is cut into training.shards={shards}; add "
-            f"--set training.shards={processes} (results depend on the shards, not on the processes)"
+            f"torchrun started {processes} processes, but a minibatch is cut into training.shards={shards}; "
+            f"add --set training.shards={processes} (results depend on the shards, not on the processes)"
         )
     workers = Workers(jobs) if processes == 1 else ALONE  # torchrun's others train along
     clock, given = Clock(), None
@@ -100,18 +99,16 @@ def fit(
         if isinstance(demonstrations, Iterable) and not isinstance(demonstrations, str | Demonstrations):
             demonstrations = Demonstrations(tuple(demonstrations))
         if isinstance(demonstrations, Demonstrations):
-            ordered = demonstrations.select(
-                sorted(demonstrations.names, key=natural)
-            )  # as they are read back
+            names = sorted(demonstrations.names, key=natural)  # as they are read back
+            ordered = demonstrations.select(names)
             given = replace(ordered, masks=demonstrations.masks)
             if keep and folder is not None:
                 spec = with_overrides(spec, {"demonstrations.path": str(folder / "demonstrations.hdf5")})
             demos: Demonstrations | None = seen(spec, given)
         else:
             if demonstrations is not None:
-                spec = with_overrides(
-                    spec, {"demonstrations.path": str(path_of(demonstrations, "demonstrations"))}
-                )
+                path = str(path_of(demonstrations, "demonstrations"))
+                spec = with_overrides(spec, {"demonstrations.path": path})
             demos = known_demonstrations(spec)
         models = check_models(spec, dimensions_for(spec, demos))
         for its, _ in models.values():
@@ -159,9 +156,8 @@ def _fit_models(
     spec, *_ = next(iter(models.values()))
     specs = {other: its for other, (its, _) in list(models.items())[1:]}
     split, size = train_and_valid(spec, demos), dimensions_for(spec, demos)
-    labels = {
-        other: its.training.labels for other, its in specs.items()
-    }  # the model chooses the recogniser of all
+    # the model chooses the recogniser of all
+    labels = {other: its.training.labels for other, its in specs.items()}
     later = {other for other, own in labels.items() if own and own.recogniser == "cross_validated"}
 
     def baseline(other: str) -> Callable[..., Fit]:
@@ -170,22 +166,17 @@ def _fit_models(
 
     # several long restarts share the processes among themselves
     short = len(spec.training.starts) == 1 or all(_over_all(*model) for model in models.values())
-    beside = [
-        other for other in specs if short and other not in later and _worth_a_process(*models[other], demos)
-    ]
+    possible = [other for other in specs if short and other not in later]
+    beside = [other for other in possible if _worth_a_process(*models[other], demos)]
     if beside:
         compile_all()
-    calls, waiting = (
-        {other: baseline(other) for other in beside},
-        {o: training_began(specs[o], o) for o in beside},
-    )
+    calls = {other: baseline(other) for other in beside}
+    waiting = {other: training_began(specs[other], other) for other in beside}
     with run_all(calls, workers, "trained a baseline", on_event, True, True, waiting) as fitted_beside:
         with clock("training"):
             free, checkpoints = max(1, workers.number() - len(beside)), folder and folder / "checkpoints"
-            prior, held_out = prior_of(spec, Workers(free)), split.get("valid")
-            trained = train_model(
-                spec, size, split["train"], on_event, checkpoints, held_out, name, free, prior
-            )
+            prior, valid = prior_of(spec, Workers(free)), split.get("valid")
+            trained = train_model(spec, size, split["train"], on_event, checkpoints, valid, name, free, prior)
         specs |= {other: _with_recogniser(specs[other], trained.summary["recogniser"]) for other in later}
         with clock("baselines"):
             here = {other: baseline(other)(on_event, workers) for other in specs if other not in beside}
@@ -197,9 +188,8 @@ def _fit_models(
             trained.contain(by_name[other].hierarchy, by_name[other].metrics.training.objective)
         hierarchy = trained.hierarchy
         if folder:
-            write_table(
-                folder / "history.csv", ("restart", "stage", "epoch", "train", "tune"), trained.history
-            )
+            columns = ("restart", "stage", "epoch", "train", "tune")
+            write_table(folder / "history.csv", columns, trained.history)
             write_model(folder, hierarchy)
         alone = workers if _worth_a_process(spec, hierarchy, demos) else ALONE
         apart = _without_each(spec, demos, folder, on_event, alone)
@@ -218,7 +208,7 @@ def _fit_models(
 
 
 def _contains(spec: Spec, baseline: Spec) -> bool:
-    """Whether a hierarchy contains a baseline, a mixture of the same policies that is trained in the same way."""
+    """Whether a hierarchy contains a baseline, a mixture of the same policies, trained in the same way."""
     if spec.hierarchy is None or baseline.hierarchy is None or spec.training.library is not None:
         return False  # of a library the two have priors of their own
     return baseline.training == spec.training and baseline.control == spec.control
@@ -229,16 +219,15 @@ def _with_recogniser(baseline: Spec, chosen: Mapping[str, Any]) -> Spec:
 
     :param chosen: of :class:`~ddco_pyro.metrics.Recogniser`.
     """
-    recogniser = {"weight": chosen["weight"], "ridge": chosen["ridge"]}
-    return with_overrides(
-        baseline, {"control.power": chosen["power"], "training.labels.recogniser": recogniser}
-    )
+    own = {"weight": chosen["weight"], "ridge": chosen["ridge"]}
+    changes = {"control.power": chosen["power"], "training.labels.recogniser": own}
+    return with_overrides(baseline, changes)
 
 
 def _without_each(
     spec: Spec, demos: Demonstrations, folder: Path | None, on_event: OnEvent, workers: Workers
 ) -> dict[str, Hierarchy]:
-    """The model trained without each demonstration, by its name; each is a fit that holds one demonstration out."""
+    """The model trained without each demonstration, by its name; each is a fit that holds one out."""
     if not spec.demonstrations.holds_out_each:
         return {}
     alone = with_overrides(spec, {"demonstrations.hold_out_by": None, "compare_with": []})
@@ -246,9 +235,8 @@ def _without_each(
     calls = {}
     for name in demos.names:
         others = replace(demos, masks={"valid": (name,)})
-        calls[name] = partial(
-            fit_beside, f"{model_name(spec)} without {name}", alone, others, places.get(name)
-        )
+        title = f"{model_name(spec)} without {name}"
+        calls[name] = partial(fit_beside, title, alone, others, places.get(name))
     with run_all(calls, workers, "trained without a demonstration", on_event) as trained:
         fits = dict(trained)
     return {name: fits[name].hierarchy for name in demos.names}
@@ -317,17 +305,12 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
         models = {first.metrics.model: each} | {
             name: [metrics.comparison[name] for metrics in each] for name in first.metrics.comparison
         }
-        held_out = {
-            name: [one.log_likelihood_per_step.valid for one in them] for name, them in models.items()
-        }
+        values = {name: [one.log_likelihood_per_step for one in them] for name, them in models.items()}
+        held_out = {name: [own.valid for own in them] for name, them in values.items()}
         nats = {part: [parts[part].nats_per_step for parts in worth] for part in worth[0]}
         errors = {part: [parts[part].standard_error for parts in worth] for part in worth[0]}
-        about = {
-            "training_seeds": [own, *others],
-            "held_out": held_out,
-            "worth": nats,
-            "standard_error": errors,
-        }
+        about = {"training_seeds": [own, *others], "held_out": held_out, "worth": nats}
+        about["standard_error"] = errors
         first.metrics.seeds = Seeds.model_validate(about)
         first.metrics.write(folder)
     return first

@@ -70,12 +70,9 @@ class Fit:
         if self.metrics is not None:
             counts, values = self.metrics.demonstrations, self.metrics.log_likelihood_per_step
             each = {"trained with": (counts.train, values.train), "held out": (counts.valid, values.valid)}
-            known = [
-                f"{value:.3f} ({number} {part})"
-                for part, (number, value) in each.items()
-                if value is not None
-            ]
-            lines.append(f"log-likelihood, nats per step: {', '.join(known)}")
+            known = {part: pair for part, pair in each.items() if pair[1] is not None}
+            said = [f"{value:.3f} ({number} {part})" for part, (number, value) in known.items()]
+            lines.append(f"log-likelihood, nats per step: {', '.join(said)}")
         return "\n  ".join(lines)
 
     __repr__ = __str__
@@ -128,7 +125,7 @@ class Fit:
 
     @cached_property
     def usual(self) -> Usual | None:
-        """What the demonstrations of the fit have in common; None of a fit with neither a folder nor demonstrations."""
+        """What the fit's demonstrations have in common; None without a folder and without demonstrations."""
         kept = None if self.folder is None else recorded(self.folder)
         if kept is None and self.given is None:
             return None
@@ -147,7 +144,8 @@ class Fit:
         fitted = [row.log_likelihood_per_step[self.name] for row in self.metrics.demonstrations_by_likelihood]
         low, high = min(fitted), max(fitted)
         less = [name for name in nats if nats[name] < 2 * low - high - self.hierarchy.scaling.size]
-        why = f"{np.median([nats[name] for name in less] or [0]):.1f} nats a step, and {low:.1f} to {high:.1f} in the fit"
+        median = np.median([nats[name] for name in less] or [0])
+        why = f"{median:.1f} nats a step, and {low:.1f} to {high:.1f} in the fit"
         return reasons_told(dict.fromkeys(less, why) | reasons, len(nats))
 
     @cached_property
@@ -170,8 +168,8 @@ class Fit:
         leads = {name: one.difference for name, one in self.metrics.comparison.items()}
         if not self.metrics.valid or any(lead.standard_error is None for lead in leads.values()):
             raise BadInput(
-                f"{self.place}: fewer than two demonstrations were held out, so no model is known to be the best; "
-                "leave out --best, or fit with a larger demonstrations.valid_fraction"
+                f"{self.place}: fewer than two demonstrations were held out, so no model is known to be the "
+                "best; leave out --best, or fit with a larger demonstrations.valid_fraction"
             )
         ahead = [name for name, lead in leads.items() if -lead.nats_per_step > (lead.standard_error or 0.0)]
         best = min(ahead, key=lambda name: leads[name].nats_per_step, default=None)
@@ -201,9 +199,8 @@ class Fit:
 
     def was_held_out(self, name: str, log_likelihood: float) -> bool:
         """Whether a demonstration is among the held-out ones: the name and the log-likelihood are equal."""
-        return bool(
-            np.isclose(self.held_out.get(name, np.nan), log_likelihood, rtol=TOLERANCE, atol=TOLERANCE)
-        )
+        known = self.held_out.get(name, np.nan)
+        return bool(np.isclose(known, log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
     def infer(self, demos: Iterable[Demonstration], held_out: bool = False) -> Iterator[Inferred]:
         """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in
@@ -224,9 +221,8 @@ class Fit:
         else:
             for demo in demos:
                 if demo.name not in self.without:
-                    raise BadInput(
-                        f"{demo.name}: no model was trained without it; {unknown(demo.name, self.without)}"
-                    )
+                    others = unknown(demo.name, self.without)
+                    raise BadInput(f"{demo.name}: no model was trained without it; {others}")
                 yield from infer(self.without[demo.name], [demo])
 
     def log_likelihood(self, demos: Iterable[Demonstration]) -> np.ndarray:
@@ -245,9 +241,8 @@ class Fit:
         (torch.Size([6, 10, 3]), 1.0)
         """
         parts = [piece.posterior for piece in self.infer(demos)]
-        return Posterior(
-            *(tuple(map(_stacked, zip(*kind, strict=True))) for kind in zip(*parts, strict=True))
-        )
+        kinds = (zip(*kind, strict=True) for kind in zip(*parts, strict=True))
+        return Posterior(*(tuple(map(_stacked, levels)) for levels in kinds))
 
     def refuse_flat(self) -> None:
         """Refuse a policy without options.
@@ -255,9 +250,8 @@ class Fit:
         :raises BadInput: this is one.
         """
         if self.spec.hierarchy is None:
-            raise BadInput(
-                f"{self.place}: is a {self.name} policy without options; name a run that has options"
-            )
+            why = f"is a {self.name} policy without options; name a run that has options"
+            raise BadInput(f"{self.place}: {why}")
 
     def segment(self, demos: Iterable[Demonstration]) -> tuple[Segmentation, ...]:
         """Choices of the most likely path, for each level, lowest first: of each demonstration an array [T].
@@ -303,9 +297,8 @@ class Fit:
 
     def controller(self, seed: int = 0) -> Controller:
         """The model as a policy that acts, as the spec's ``rollout`` says."""
-        return Controller(
-            self.hierarchy, self.spec.rollout.control, self.spec.rollout.options, seed, self.names
-        )
+        rollout = self.spec.rollout
+        return Controller(self.hierarchy, rollout.control, rollout.options, seed, self.names)
 
     def monitor(self) -> Monitor:
         """A live monitor of the active options while another policy, or a person, acts."""
@@ -339,22 +332,19 @@ def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] 
         report.
     """
     folder = path_of(folder, "folder")
-    missing = [
-        name for name in ("spec.yaml", "model.safetensors", "metrics.json") if not (folder / name).exists()
-    ]
+    files = ("spec.yaml", "model.safetensors", "metrics.json")
+    missing = [name for name in files if not (folder / name).exists()]
     if missing:
-        what = (
-            "not a run folder" if "spec.yaml" in missing else "an unfinished run: fit it again to continue it"
-        )
+        unfinished = "an unfinished run: fit it again to continue it"
+        what = "not a run folder" if "spec.yaml" in missing else unfinished
         if (folder / "folds.json").exists():
             what = f"a selection; the fit of what it chose is in {folder / 'fit'} once it is done"
         raise BadInput(f"{folder}: {what} (it has no {missing[0]})")
     recorded(folder)  # or the format is another, and so are the keys of the spec
     fitted, spec = (load_spec(folder / "spec.yaml", those, allow_code) for those in ((), overrides))
     if spec.model_copy(update={"report": fitted.report}) != fitted:
-        raise SpecError(
-            f"{folder}: is fitted; only settings of the report can change, such as report.trajectory=KEY"
-        )
+        why = "only settings of the report can change, such as report.trajectory=KEY"
+        raise SpecError(f"{folder}: is fitted; {why}")
     hierarchy = read_model(folder, spec)
     metrics = Metrics.read(folder, [level.count for level in spec.levels])
     return Fit(spec, hierarchy, metrics, folder, named=read_names(folder, spec) or {})

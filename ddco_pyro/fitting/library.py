@@ -1,4 +1,4 @@
-"""Libraries: which model of a run is the prior of a new task's, and how strong a prior its own tasks choose."""
+"""Libraries: which model of a run is the prior of a new task's, and what strength its own tasks choose."""
 
 from __future__ import annotations
 
@@ -52,13 +52,12 @@ def library_of(spec: Spec) -> Fit | None:
     for one in models:
         if _model(one.spec) == _model(spec):
             return one
-    nearest = min(
-        models, key=lambda one: sum(_model(one.spec)[key] != own for key, own in _model(spec).items())
-    )
-    differing = next(key for key, own in _model(spec).items() if _model(nearest.spec)[key] != own)
+    asked = _model(spec)
+    differing = [[key for key, own in asked.items() if _model(one.spec)[key] != own] for one in models]
+    nearest = min(differing, key=len)
     raise SpecError(
-        f"training.library.run: {given.run} has no model with this {differing}; take observations, control and "
-        f"networks of {Path(given.run) / 'spec.yaml'} (ddco-pyro fit NEW.yaml --library {given.run} does)"
+        f"training.library.run: {given.run} has no model with this {nearest[0]}; take observations, control "
+        f"and networks of {Path(given.run) / 'spec.yaml'} (ddco-pyro fit NEW.yaml --library {given.run} does)"
     )
 
 
@@ -82,12 +81,9 @@ def check_library(spec: Spec) -> None:
     :raises BadInput: it is not, or it cannot.
     """
     given, library = spec.training.library, library_of(spec)
-    if (
-        given is not None
-        and library is not None
-        and given.ridge is None
-        and not (library.run_folder / STORED).exists()
-    ):
+    if given is None or library is None or given.ridge is not None:
+        return
+    if not (library.run_folder / STORED).exists():
         _several_tasks(library)
 
 
@@ -114,11 +110,8 @@ def for_new_task(path: Path, run: Path, overrides: Iterable[str] = (), allow_cod
         "demonstrations": {"valid_fraction": 0, "hold_out_by": None, "exclude": [], "where": {}},
         "training": {"tune_fraction": 0, "library": {"run": str(run)}},
     }
-    said = [
-        f"{key}={dump_yaml(value)}"
-        for part in (alone, read_mapping(path, "spec"))
-        for key, value in _leaves(part)
-    ]
+    parts = (alone, read_mapping(path, "spec"))
+    said = [f"{key}={dump_yaml(value)}" for part in parts for key, value in _leaves(part)]
     return load_spec(run / "spec.yaml", [*said, *overrides], allow_code)
 
 
@@ -168,13 +161,14 @@ def _several_tasks(library: Fit) -> tuple[Demonstrations, dict[str, list[str]]]:
     each = by_task({demo.name: demo.attributes for demo in demos})
     tasks = {task: names for task, names in each.items() if len(names) > 1}
     if len(tasks) < 2:
-        text = f"{library.run_folder}: has demonstrations of {len(tasks)} task(s) with two or more, by the attribute"
-        raise BadInput(f"{text} {TASK!r}; say how strong a prior it is: training.library.ridge=30")
+        text = f"{library.run_folder}: has demonstrations of {len(tasks)} task(s) with two or more"
+        remedy = "say how strong a prior it is: training.library.ridge=30"
+        raise BadInput(f"{text}, by the attribute {TASK!r}; {remedy}")
     return demos, tasks
 
 
 def _predicted(spec: Spec, demos: Demonstrations, names: Sequence[str], spread: float) -> list[float]:
-    """:func:`imitation_error` in a task's demonstrations but the first, by a library without it, for each strength."""
+    """``imitation_error`` in a task's demonstrations but the first, by a library without it, by strength."""
     others = demos.select(name for name in demos.names if name not in names)
     if spec.sees_task:
         others = with_tasks(others)

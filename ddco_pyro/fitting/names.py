@@ -41,15 +41,14 @@ def checked(spec: Spec, given: Any) -> Named:
     named = {}
     for level, names in given.items():
         if level not in counts:
-            raise BadInput(
-                f"there is no level {level!r}{nearest(level, counts)}; there is: {', '.join(counts)}"
-            )
+            missing = f"there is no level {level!r}{nearest(level, counts)}"
+            raise BadInput(f"{missing}; there is: {', '.join(counts)}")
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
             raise BadInput(f"level {level!r}: give a list of texts; quote a number")
         if len(names) != counts[level]:
             raise BadInput(
-                f"level {level!r}: {len(names)} names for {counts[level]} options; name each, in the order of options "
-                f"1 to {counts[level]}"
+                f"level {level!r}: {len(names)} names for {counts[level]} options; name each, in the order "
+                f"of options 1 to {counts[level]}"
             )
         named[level] = own = tuple(name.strip() for name in names)
         if bad := [option for option, name in enumerate(own, 1) if not (name and name.isprintable())]:
@@ -104,9 +103,8 @@ def matched(
     :param segments: the most likely choices of each level, of each demonstration [T].
     """
     levels, known = spec.levels, label_names(train.attributes)
-    labels = dict(
-        zip((level.name for level in levels), spec.demonstrations.labels_by_level(len(levels)), strict=False)
-    )
+    sources = spec.demonstrations.labels_by_level(len(levels))
+    labels = dict(zip((level.name for level in levels), sources, strict=False))
     found: list[NamedByLabel] = []
     for level, choices in zip(levels, segments, strict=True):
         own = trained if trained and trained.level == level.name else None
@@ -122,10 +120,8 @@ def matched(
                 continue
             here = np.equal(table.labels, value)[:, None] & np.equal(table.options, option)
             both = int(steps[here].sum())
-            each = (
-                int(steps[:, here.any(0)].sum()),
-                int(steps[here.any(1)].sum()),
-            )  # of the option, of the label
+            # of the option, of the label
+            each = (int(steps[:, here.any(0)].sum()), int(steps[here.any(1)].sum()))
             name = label_name(label, value, known.get(label, ()), level.name)
             taken = name in (option_name(0), *(one.name for one in found if one.level == level.name))
             if not taken and (own or 2 * both > max(each)):
@@ -145,13 +141,9 @@ def accepted(spec: Spec, found: Sequence[NamedByLabel]) -> Named:
     named: Named = {}
     for level in spec.levels:
         given = spec.training.labels is not None and spec.training.labels.level == level.name
-        own = {
-            one.option: one.name
-            for one in found
-            if one.level == level.name and (given or one.agreement >= AGREED)
-        }
+        here = [one for one in found if one.level == level.name]
+        own = {one.option: one.name for one in here if given or one.agreement >= AGREED}
         if own:
-            named[level.name] = tuple(
-                own.get(option, option_name(option)) for option in range(1, 1 + level.count)
-            )
+            options = range(1, 1 + level.count)
+            named[level.name] = tuple(own.get(option, option_name(option)) for option in options)
     return named

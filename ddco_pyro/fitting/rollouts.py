@@ -33,16 +33,14 @@ def policies(fit: Fit, best: bool = False) -> dict[str, Policy | str]:
     unknown = [name for name in fit.spec.rollout.policies if name not in known]
     if unknown:
         raise BadInput(
-            f"rollout.policies: task {fit.spec.task!r} has no {', '.join(unknown)} (it has: {', '.join(known)})"
+            f"rollout.policies: task {fit.spec.task!r} has no {', '.join(unknown)} (it has: "
+            f"{', '.join(known)})"
         )
     scripted: dict[str, Policy | str] = {name: name for name in fit.spec.rollout.policies}
     if best:
         return scripted | {fit.best.name: fit.best.controller()}
-    return (
-        scripted
-        | {name: other.controller() for name, other in fit.baselines.items()}
-        | {fit.name: fit.controller()}
-    )
+    baselines = {name: other.controller() for name, other in fit.baselines.items()}
+    return scripted | baselines | {fit.name: fit.controller()}
 
 
 def roll_out(
@@ -70,12 +68,8 @@ def roll_out(
     played = policies(fit, best)
     held = fit.metrics.rollouts
     whole = held and (held.seed, held.episodes, {*held.methods}) == (seeds.start, episodes, {*played})
-    if (
-        held
-        and whole
-        and resume
-        and all(_film(fit, name, seed).exists() for name in played for seed in seeds[:film])
-    ):
+    films = [_film(fit, name, seed) for name in played for seed in seeds[:film]]
+    if held and whole and resume and all(film.exists() for film in films):
         return held
     by_method: dict[str, list[dict[str, float]]] = {}
     for name, policy in played.items():
@@ -83,9 +77,8 @@ def roll_out(
         for episode in run_episodes(str(fit.spec.task), policy, seeds, film, jobs, fit.spec.observed, ()):
             by_method[name].append(episode.outcome)
             if episode.frames:
-                names = (
-                    [*policy.names.values()] if isinstance(policy, Controller) else []
-                )  # lowest level first
+                # lowest level first
+                names = [*policy.names.values()] if isinstance(policy, Controller) else []
                 write_film(_film(fit, name, episode.seed), episode, names)
             on_event(Counted("rolling out", len(played) * episodes, method(name)))
     task = find_task(str(fit.spec.task))
@@ -129,9 +122,8 @@ def roll_out_repetitions(first: Fit, on_event: OnEvent = ignore, jobs: int = -1)
         return
     each = [rollouts]
     for again in first.repetitions:
-        alone = replace(
-            again, spec=with_overrides(again.spec, {"rollout.policies": []})
-        )  # scripts have no seeds
+        spec = with_overrides(again.spec, {"rollout.policies": []})  # scripts have no seeds
+        alone = replace(again, spec=spec)
         each.append(roll_out(alone, rollouts.episodes, 0, on_event, jobs, resume=True))
     rates = {name: [one.success_rates[name].rate for one in each] for name in each[-1].success_rates}
     parts = [one.worth.parts if one.worth else {} for one in each]

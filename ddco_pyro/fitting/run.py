@@ -53,9 +53,8 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
     if path.exists():
         same = same_model = path.read_bytes() == text.encode()
         with suppress(SpecError):  # user code is not imported by reading its name
-            same_model = (
-                same or load_spec(path, allow_code=True).model_copy(update={"report": spec.report}) == spec
-            )
+            changed = {"report": spec.report}
+            same_model = same or load_spec(path, allow_code=True).model_copy(update=changed) == spec
         if not same_model:
             raise BadInput(f"{folder}: holds a run of another spec; choose another --out or remove it")
         if not resume and is_finished(folder) and (folder / "report.html").exists():  # what `fit` writes last
@@ -70,7 +69,7 @@ def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether a run is complete: ``metrics.json`` is written last. A damaged file that was removed is made again."""
+    """Whether a run is complete: ``metrics.json`` is written last. A file that was removed is made again."""
     return all((folder / name).exists() for name in ("model.safetensors", "metrics.json"))
 
 
