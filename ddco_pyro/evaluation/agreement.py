@@ -135,7 +135,7 @@ def of_equal_lengths(
 
 
 def confusion(segments: Sequence[np.ndarray], labels: Sequence[np.ndarray]) -> Confusion:
-    """Steps of each label (rows) in each option (columns), and the label with which each option is matched globally."""
+    """Steps of each label (rows) in each option (columns), and the label each option matches globally."""
     pairs = _known(segments, labels)
     if not pairs:
         return Confusion(labels=[], options=[], steps=[], matched=[])
@@ -233,7 +233,7 @@ def boundary_distances(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> 
 
 
 def _overlap_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], overlap: float) -> float:
-    """F1 of segments: right is one that overlaps enough with the segment of its label with which it overlaps most."""
+    """F1 of segments: right is one that overlaps enough with the one of its label that it overlaps most."""
     right = segments = 0
     for h, label in zip(ours, truth, strict=True):
         starts, begins = (np.concatenate([[0], _boundaries(sequence)]) for sequence in (h, label))
@@ -255,19 +255,19 @@ def _overlap_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], overlap
 MATCHINGS = {"matched_globally": "one for all", "matched_per_demonstration": "each its own"}
 
 EXPLAINED = (
-    "All measures are at most 1, which is perfect. NMI (normalised mutual information) and ARI (adjusted Rand index, 0 "
-    "by chance) compare steps without regard to the options' names. Boundary F1 compares the steps at which segments "
-    "begin, within so many steps. The other measures match options with labels so that most steps agree. The match is "
-    "the same in all demonstrations (one for all) or separate in each (each its own). Accuracy: share of steps that "
-    "agree. IoU: intersection over union, mean over labels. F1@P: a segment is right where it overlaps one of its "
-    "label by P % or more. Edit: 1 − edit distance of the sequences of segments. Equal lengths: what cutting each "
-    "demonstration into equal parts, as many as options, reaches without looking at it. Of several tasks, each measure "
-    "is the mean over tasks."
+    "All measures are at most 1, which is perfect. NMI (normalised mutual information) and ARI (adjusted "
+    "Rand index, 0 by chance) compare steps without regard to the options' names. Boundary F1 compares the "
+    "steps at which segments begin, within so many steps. The other measures match options with labels so "
+    "that most steps agree. The match is the same in all demonstrations (one for all) or separate in each "
+    "(each its own). Accuracy: share of steps that agree. IoU: intersection over union, mean over labels. "
+    "F1@P: a segment is right where it overlaps one of its label by P % or more. Edit: 1 − edit distance of "
+    "the sequences of segments. Equal lengths: what cutting each demonstration into equal parts, as many as "
+    "options, reaches without looking at it. Of several tasks, each measure is the mean over tasks."
 )
 
 
 def tolerances(frequency: float | None) -> str:
-    """A sentence on the seconds of the tolerances of boundary F1; empty where the frequency (Hz) is not known."""
+    """A sentence on the seconds of boundary F1's tolerances; empty where the frequency (Hz) is unknown."""
     each = "; ".join(f"±{duration(frequency, steps)}" for steps in TOLERANCES)
     return f"Tolerances of boundary F1: {each}." if frequency else ""
 
@@ -334,9 +334,8 @@ def compare_annotators(first: str | Path, second: str | Path, tolerance: int) ->
     known = [our_names, their_names]
     shared = [name for name in ours if name in theirs]
     if not shared:
-        raise BadInput(
-            f"{second}: has none of the demonstrations of {first}; name a file with other labels of them"
-        )
+        why = f"has none of the demonstrations of {first}; name a file with other labels of them"
+        raise BadInput(f"{second}: {why}")
     labels: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for demo in shared:
         a, b = ours[demo], theirs[demo]
@@ -347,15 +346,11 @@ def compare_annotators(first: str | Path, second: str | Path, tolerance: int) ->
             labels.setdefault(name, []).append((a[name], b[name]))
     if not labels:
         raise BadInput(f"{second}: has no labels that {first} has, too; labels of the same name are compared")
-    return {
-        name: compared(
-            name,
-            pairs,
-            [own.get(name) or known[1 - n].get(name, []) for n, own in enumerate(known)],
-            tolerance,
-        )
-        for name, pairs in sorted(labels.items())
-    }
+    found = {}
+    for name, pairs in sorted(labels.items()):
+        each = [own.get(name) or known[1 - n].get(name, []) for n, own in enumerate(known)]
+        found[name] = compared(name, pairs, each, tolerance)
+    return found
 
 
 def _read(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, list[str]]]:
@@ -383,22 +378,16 @@ def compared(
     """
     from sklearn.metrics import cohen_kappa_score
 
-    words = [
-        {
-            value: label_name(name, value, own)
-            for value in np.unique(np.concatenate(side)).tolist()
-            if value != UNKNOWN
-        }
-        for side, own in zip(zip(*pairs, strict=True), known, strict=True)
-    ]
+    words = []
+    for side, own in zip(zip(*pairs, strict=True), known, strict=True):
+        values = np.unique(np.concatenate(side)).tolist()
+        words.append({value: label_name(name, value, own) for value in values if value != UNKNOWN})
     names = list(dict.fromkeys([*words[0].values(), *words[1].values()]))
     counts, boundaries, distances = np.zeros((len(names), len(names)), int), [0, 0], list[int]()
     for labels in pairs:
         said = (labels[0] != UNKNOWN) & (labels[1] != UNKNOWN)
-        both = [
-            [names.index(of[value]) for value in own[said].tolist()]
-            for own, of in zip(labels, words, strict=True)
-        ]
+        sides = zip(labels, words, strict=True)
+        both = [[names.index(of[value]) for value in own[said].tolist()] for own, of in sides]
         np.add.at(counts, tuple(np.array(both, int)), 1)
         inner = said[1:] & said[:-1]
         first, second = (np.flatnonzero((np.diff(own) != 0) & inner) + 1 for own in labels)

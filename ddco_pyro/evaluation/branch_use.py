@@ -1,4 +1,4 @@
-"""Use of the branches of a network: activation, and loss in log-likelihood when the input is shuffled (SM 1.4)."""
+"""Use of the branches of a network: activation, and loss in log-likelihood under shuffled input (SM 1.4)."""
 
 from __future__ import annotations
 
@@ -42,15 +42,14 @@ def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[BranchU
     found = []
     for level, network in branched.items():
         tables = (sums[level][..., :2] / sums[level][..., 2:]).permute(2, 0, 1).tolist()
-        activation, loss = (
-            [[None if math.isnan(x) else x for x in row] for row in table] for table in tables
-        )
+        known = ([[None if math.isnan(x) else x for x in row] for row in table] for table in tables)
+        activation, loss = known
         found.append(BranchUse(level=level, branches=list(network.names), activation=activation, loss=loss))
     return found
 
 
 def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
-    """The branches that each level's policies read, by level; the meta-policy is the last level, a trunk is of all."""
+    """The branches that each level's policies read; the meta-policy is the last level, a trunk is of all."""
     by_level: dict[int, Branches] = {}
     for place, network in hierarchy.networks().items():
         inside = next((module for module in network.modules() if isinstance(module, Branches)), None)
@@ -82,7 +81,7 @@ def _sums(piece: Inferred, level: int, branch: nn.Module) -> Tensor:
 
 
 def _score(piece: Inferred, outputs: Outputs, level: int, weight: Tensor) -> Tensor:
-    """The weighted log-density of each caller's control; for the meta-policy the whole log-likelihood, [K]."""
+    """The weighted log-density of each caller's control; of the meta-policy the whole log-likelihood, [K]."""
     if level == piece.hierarchy.depth:
         return log_predictive(outputs.tables(piece.batch.actions), piece.batch.lengths).sum().reshape(1)
     emission = outputs.emissions[level]

@@ -58,9 +58,8 @@ def drawn(
     edges = [0, *(np.flatnonzero(starts[1:]) + 1).tolist(), steps]
     for before, step, after in zip(edges, edges[1:-1], edges[2:], strict=False):
         window = np.arange(before + 1, after)
-        here = (options[:, before : after - 1] == path[step - 1]) & (
-            options[:, before + 1 : after] == path[step]
-        )
+        ended, begun = options[:, before : after - 1], options[:, before + 1 : after]
+        here = (ended == path[step - 1]) & (begun == path[step])
         here &= chosen[:, before + 1 : after]
         distance = np.where(here, np.abs(window - step), steps)
         yield step, np.sort(window[distance.argmin(1)][here.any(1)])
@@ -127,7 +126,7 @@ class Inferred:
 
     @cached_property
     def path(self) -> Path:
-        """Choices and terminations of the most likely path, [N, T] for each level; -1 past a demonstration's end."""
+        """Choices and terminations of the most likely path, [N, T] for each level; -1 past the end."""
         return most_likely_path(self.tables, self.batch.lengths)
 
     @cached_property
@@ -141,36 +140,32 @@ class Inferred:
         return [level.termination is not None for level in self.hierarchy.option_levels()]
 
     def segmented(self, row: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The most likely choices of one demonstration, and where segments begin, each [T], for each level."""
+        """The most likely choices of a demonstration, and where segments begin, each [T], for each level."""
         steps = self.lengths[row]
         paths = ((choices[row, :steps].numpy().copy(), ends[row, :steps].numpy())
                  for choices, ends in zip(*self.path, strict=True))  # fmt: skip
-        return [
-            (path, started(path, ends, own)) for (path, ends), own in zip(paths, self._lasts, strict=True)
-        ]
+        own = zip(paths, self._lasts, strict=True)
+        return [(path, started(path, ends, lasts)) for (path, ends), lasts in own]
 
     def draws(self, row: int, number: int, seed: Sequence[int]) -> np.ndarray:
         """Choices and terminations of draws from p(ζ | ξ) for one demonstration, [2, D, number, T]."""
         length = self.lengths[row]
-        path = sample_paths(
-            self.tables.part(torch.tensor([row]), length), torch.tensor([length]), number, seed
-        )
+        tables = self.tables.part(torch.tensor([row]), length)
+        path = sample_paths(tables, torch.tensor([length]), number, seed)
         return torch.stack([torch.stack(kind)[:, :, 0] for kind in path]).numpy()
 
     def drawn(self, row: int) -> list[dict[int, np.ndarray]]:
-        """The boundaries of one demonstration, for each level: their steps in draws, by the step of the path."""
+        """The boundaries of a demonstration, by level: their steps in draws, by the step of the path."""
         found, draws = [], self.draws(row, DRAWS, (0, self.lengths[row]))
-        for lasting, (path, starts), options, ended in zip(
-            self._lasts, self.segmented(row), *draws, strict=True
-        ):
+        levels = zip(self._lasts, self.segmented(row), *draws, strict=True)
+        for lasting, (path, starts), options, ended in levels:
             found.append(dict(drawn(path, starts, options, started(options, ended, lasting))))
         return found
 
     def intervals(self, row: int) -> list[np.ndarray]:
-        """The 90 % interval of the first step of each segment of one demonstration, for each level, [segments, 2]."""
-        return [
-            np.array([(0, 0), *(within(at, step) for step, at in level.items())]) for level in self.drawn(row)
-        ]
+        """The 90 % interval of the first step of each segment of a demonstration, by level, [segments, 2]."""
+        each = ([within(at, step) for step, at in level.items()] for level in self.drawn(row))
+        return [np.array([(0, 0), *own]) for own in each]
 
 
 def started(options: np.ndarray, terminations: np.ndarray, lasts: bool) -> np.ndarray:
@@ -269,9 +264,8 @@ def infer(hierarchy: Hierarchy, demonstrations: Iterable[Demonstration]) -> Iter
     """
     for group in _groups(_read(demonstrations, hierarchy), hierarchy.steps_at_once):
         demos = Demonstrations(tuple(group))
-        yield Inferred(
-            demos.names, encode(demos, hierarchy.encoder, hierarchy.scaling, fitted=True), hierarchy
-        )
+        batch = encode(demos, hierarchy.encoder, hierarchy.scaling, fitted=True)
+        yield Inferred(demos.names, batch, hierarchy)
 
 
 def _read(demonstrations: Iterable[Demonstration], hierarchy: Hierarchy) -> Iterator[Demonstration]:
@@ -290,12 +284,11 @@ def _read(demonstrations: Iterable[Demonstration], hierarchy: Hierarchy) -> Iter
 
 
 def _groups(demonstrations: Iterable[Demonstration], steps: int) -> Iterator[list[Demonstration]]:
-    """Consecutive demonstrations with at most so many steps, padding included, and at least one demonstration."""
+    """Consecutive demonstrations with at most so many steps, padding included, and at least one of them."""
     group: list[Demonstration] = []
     for demo in demonstrations:
-        observed = sum(
-            array[0].nbytes for array in demo.observations.values() if isinstance(array, np.ndarray)
-        )
+        arrays = demo.observations.values()
+        observed = sum(array[0].nbytes for array in arrays if isinstance(array, np.ndarray))
         at_most = min(steps, GROUP_BYTES / (COPIES * observed + INFERENCE))
         if group and (len(group) + 1) * max(len(demo), *map(len, group)) > at_most:
             yield group

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.drawing.words import capital, duration, listed, number, percent
-from ddco_pyro.evaluation.verdicts import said
+from ddco_pyro.evaluation.verdicts import Direction, said
 from ddco_pyro.inference import Posterior
 from ddco_pyro.metrics import Alike, Metrics, Segments, Use
 from ddco_pyro.model.outputs import CallerOutputs, Outputs
@@ -107,9 +107,8 @@ def segments_of(paths: Sequence[np.ndarray], frequency: float | None = None) -> 
     shortest = (TWITCH_SECONDS * frequency if frequency else least for least in unknown)
     twitches = sum(int((own < least).sum()) for own, least in zip(each, shortest, strict=True))
     every = np.concatenate(each)
-    return Segments(
-        median=float(np.median(every)), number=len(every), demonstrations=len(paths), twitches=twitches
-    )
+    median = float(np.median(every))
+    return Segments(median=median, number=len(every), demonstrations=len(paths), twitches=twitches)
 
 
 def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]]:
@@ -126,9 +125,8 @@ def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]
         levels = levels or [0.0 for _ in posterior.u]
         for place, (own, u) in enumerate(zip(outputs.callers[:-1], posterior.u, strict=True)):
             own = own.map(Tensor.double)
-            levels[place] = levels[place] + torch.stack(
-                [_divergence(own, i, u) for i in range(u.shape[-1] - 1)]
-            )
+            each = [_divergence(own, i, u) for i in range(u.shape[-1] - 1)]
+            levels[place] = levels[place] + torch.stack(each)
     return [
         [
             Alike(options=(i + 1, j + 1), divergence=total / weight if weight > 0 else None)
@@ -158,7 +156,7 @@ UNUSED_SHARE = 0.01
 DOMINATING_SHARE = 0.9
 SHORTEST_DURATION = 1.5
 AGAIN_AND_AGAIN = 3.0
-"""Selections in each demonstration with the option; one selection of a single step may be meant, such as a grasp."""
+"""Selections in each demonstration with the option; one of a single step may be meant, such as a grasp."""
 
 HIGH_FITTING_SHARE = 0.5
 SMALLEST_DIVERGENCE = 0.1
@@ -173,20 +171,20 @@ MOSTLY = 2 / 3
 Kind = Literal["unused", "redundant", "dominating", "whole", "never_persisting", "brief", "high_fitting"]
 
 ADVICE: Mapping[Kind, str] = {
-    "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select), or try "
-    "more starts (training.starts).",
-    "redundant": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro select). If "
-    "they should differ, lower control.std, below which differences do not count.",
-    "dominating": "Train layer by layer (training.layerwise: true), or give the options' policies less capacity, so "
-    "that one of them cannot do all the work.",
-    "whole": "Observe what is alike in all demonstrations: write positions relative to the first step, or differences "
-    "alone, into the file.",
-    "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change more "
-    "slowly (differences: false) let options last.",
+    "unused": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro "
+    "select), or try more starts (training.starts).",
+    "redundant": "Fewer options may do: compare hierarchy.levels.*.count by cross-validation (ddco-pyro "
+    "select). If they should differ, lower control.std, below which differences do not count.",
+    "dominating": "Train layer by layer (training.layerwise: true), or give the options' policies less "
+    "capacity, so that one of them cannot do all the work.",
+    "whole": "Observe what is alike in all demonstrations: write positions relative to the first step, or "
+    "differences alone, into the file.",
+    "never_persisting": "A simpler termination (network: linear), fewer options, or observations that change "
+    "more slowly (differences: false) let options last.",
     "brief": "Options so short are parts of one movement, not skills. Ask for longer ones (control.power, or "
     "ddco-pyro init --segment), take fewer options, or import at a lower rate (ddco-pyro import --hz).",
-    "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, or let it "
-    "emit options only (emits: [options]).",
+    "high_fitting": "Train layer by layer (training.layerwise: true), give the calling policy less capacity, "
+    "or let it emit options only (emits: [options]).",
 }
 """The usual remedies."""
 
@@ -197,7 +195,7 @@ LABELS = (
 """The same where equal parts agree better with labels."""
 
 START: Mapping[Kind, str] = {"unused": "vq", "redundant": "vq_controls", "dominating": "vq"}
-"""The initialisation from clusters that is a remedy, too, unless training starts from labels or from clusters."""
+"""The initialisation from clusters that is a remedy, too, unless training starts from labels or clusters."""
 
 
 @dataclass(frozen=True)
@@ -287,15 +285,16 @@ def diagnose(
 
 
 SOUND = (
-    "Training converged, and the model predicts held-out controls better than the mean and the spread of each control "
-    "do. Every option is used (at least 1 % of all steps) and none dominates (more than 90 %). No two options act "
-    "alike (differ by less than 0.1 nats per step). No option ends at once again and again (lasts less than 1.5 steps, "
-    "with three selections or more in a demonstration). No option takes some demonstrations whole (at least 90 % of "
-    "their steps, or two thirds of no more than half of the demonstrations). Options do not switch all the time (six "
-    "segments or more in a demonstration, most of them below 0.5 s, or 5 steps or a fiftieth of their demonstration "
-    "where the rate is unknown). No caller emits the control itself most of the time."
+    "Training converged, and the model predicts held-out controls better than the mean and the spread of "
+    "each control do. Every option is used (at least 1 % of all steps) and none dominates (more than 90 %). "
+    "No two options act alike (differ by less than 0.1 nats per step). No option ends at once again and "
+    "again (lasts less than 1.5 steps, with three selections or more in a demonstration). No option takes "
+    "some demonstrations whole (at least 90 % of their steps, or two thirds of no more than half of the "
+    "demonstrations). Options do not switch all the time (six segments or more in a demonstration, most of "
+    "them below 0.5 s, or 5 steps or a fiftieth of their demonstration where the rate is unknown). No caller "
+    "emits the control itself most of the time."
 )
-"""What was looked at where nothing is doubtful. A sign of two options that act alike is of used ones alone."""
+"""What was looked at where nothing is doubtful. A sign of two options that act alike is of used ones only."""
 
 
 # --- signs in words -----------------------------------------------------------------------------------------
@@ -321,8 +320,9 @@ def unlabelled_start(training: TrainingSpec) -> list[tuple[str, str]]:
     blind = [start for start in training.starts if WAYS[start].ordered]
     if training.labels is None or not blind:
         return []
-    text = f"training.starts: {listed(blind)} numbers options in the order of time, whatever training.labels say."
-    return [(text, "Start from what labelled steps say of the others (training.starts: [vq_controls]).")]
+    text = f"training.starts: {listed(blind)} numbers options in the order of time, whatever "
+    remedy = "Start from what labelled steps say of the others (training.starts: [vq_controls])."
+    return [(f"{text}training.labels say.", remedy)]
 
 
 def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
@@ -364,9 +364,8 @@ def beside_equal_parts(metrics: Metrics) -> list[tuple[str, bool]]:
             numbers["accuracy"] = percent(own.matched_globally.accuracy)
             numbers["equal_accuracy"] = percent(other.matched_globally.accuracy)
             worse, part = own.nmi < other.nmi, "held out" if valid else "in training"
-            told.append(
-                (said("labels", "worse" if worse else "better", labels=labels, part=part, **numbers), worse)
-            )
+            way: Direction = "worse" if worse else "better"
+            told.append((said("labels", way, labels=labels, part=part, **numbers), worse))
     return told
 
 
@@ -375,9 +374,8 @@ def _sign(findings: Sequence[Finding], level: str, names: Sequence[str], frequen
     kind, first, many = findings[0].kind, findings[0], len(findings)
     if kind == "high_fitting":
         share = first.amount(frequency)
-        return (
-            f"High-fitting: the caller of level “{level}” emits the control itself in {share} of its steps."
-        )
+        deed = f"emits the control itself in {share} of its steps"
+        return f"High-fitting: the caller of level “{level}” {deed}."
     if kind == "brief":
         return (
             f"Options of level “{level}” switch every {first.amount(frequency)} (the median segment). "

@@ -29,7 +29,7 @@ from ddco_pyro.names import FLAT, HIERARCHY, MIXTURE, method
 from ddco_pyro.statistics import paired, t_quantile, wider_interval
 
 SMALLEST = 0.01
-"""The smallest useful difference in nats per step: each step's control is exp(0.01) times as probable, 1 % more."""
+"""Smallest useful difference in nats per step: a step's control is exp(0.01) times as probable, 1 % more."""
 
 LOST = 1.0
 """Nats per step and control dimension, from training to held-out demonstrations, from which on a model may
@@ -45,58 +45,35 @@ OVER = {"one": "In this fit", "several": "Over {seeds} training seeds"}
 
 SENTENCES: Mapping[tuple[str, Direction], str] = {
     # options that last against the mixture
-    (
-        "controls",
-        "better",
-    ): "{over} options that last predict held-out controls better than the mixture does: {lead}.",
-    (
-        "controls",
-        "worse",
-    ): "{over} options that last predict held-out controls worse than the mixture does: {lead}.",
-    (
-        "controls",
-        "same",
-    ): "{over} options that last predict held-out controls as well as the mixture does: {lead}.",
-    (
-        "controls",
-        "unclear",
-    ): "{over} it is inconclusive whether options that last predict held-out controls better "
-    "than the mixture does: {lead}.",
-    (
-        "controls",
-        "brief",
-    ): "{over} very short options predict held-out controls better than the mixture does: {lead}. "
-    "{brief}, and they are no skills.",
-    (
-        "controls",
-        "few",
-    ): "Too few demonstrations ({held_out}) are held out to compare options that last with the "
-    "mixture: {lead}.",
+    ("controls", "better"): "{over} options that last predict held-out controls better than the mixture "
+    "does: {lead}.",
+    ("controls", "worse"): "{over} options that last predict held-out controls worse than the mixture "
+    "does: {lead}.",
+    ("controls", "same"): "{over} options that last predict held-out controls as well as the mixture "
+    "does: {lead}.",
+    ("controls", "unclear"): "{over} it is inconclusive whether options that last predict held-out controls "
+    "better than the mixture does: {lead}.",
+    ("controls", "brief"): "{over} very short options predict held-out controls better than the mixture "
+    "does: {lead}. {brief}, and they are no skills.",
+    ("controls", "few"): "Too few demonstrations ({held_out}) are held out to compare options that last with "
+    "the mixture: {lead}.",
     ("success", "better"): "{over} options succeed more often than the mixture: {lead}.",
     ("success", "worse"): "{over} options succeed less often than the mixture: {lead}.",
-    (
-        "success",
-        "unclear",
-    ): "{over} it is inconclusive whether options succeed more often than the mixture: {lead}.",
+    ("success", "unclear"): "{over} it is inconclusive whether options succeed more often than the mixture: "
+    "{lead}.",
     ("success", "few"): "Success was not measured.",
     # a model against another one
     ("model", "better"): "{by} nats per step better than {other}",
     ("model", "worse"): "{by} nats per step worse than {other}",
     ("model", "unclear"): "with no clear difference from {other} ({lead} nats per step)",
     # options against labels and against equal parts of each demonstration
-    (
-        "labels",
-        "better",
-    ): "Options agree better with labels “{labels}” than equal parts of each demonstration "
-    "do: NMI {ours} against {equal}, accuracy {accuracy} against {equal_accuracy}, {part}.",
+    ("labels", "better"): "Options agree better with labels “{labels}” than equal parts of each "
+    "demonstration do: NMI {ours} against {equal}, accuracy {accuracy} against {equal_accuracy}, {part}.",
     ("labels", "worse"): "Equal parts of each demonstration agree better with labels “{labels}” than options "
     "do: NMI {equal} against {ours}, accuracy {equal_accuracy} against {accuracy}, {part}.",
     # doubts
-    (
-        "held out",
-        "worse",
-    ): "{name} fell apart on held-out demonstrations: {valid} nats per step there, {train} "
-    "in training. That is {loss} less for each of {controls} controls.",
+    ("held out", "worse"): "{name} fell apart on held-out demonstrations: {valid} nats per step there, "
+    "{train} in training. That is {loss} less for each of {controls} controls.",
     ("marginal", "worse"): "{name} {predict} held-out controls worse than the mean and the spread of each "
     "control do: {valid} against {marginal} nats per step.",
     ("flat", "worse"): "{name} {are} below {other} by {by} nats per step on held-out demonstrations.",
@@ -109,16 +86,17 @@ SENTENCES: Mapping[tuple[str, Direction], str] = {
 {lead} is always options minus the mixture."""
 
 ADVICE: Mapping[str, str] = {
-    "held out": "Such a fit follows its training demonstrations too closely, and comparisons with it say nothing. Take "
-    "fewer options or observations, smaller networks, larger ridges (training.optimizer.ridge), or more "
-    "demonstrations.",
-    "baseline": "Comparisons with this baseline say nothing. Give it a smaller network or larger ridges (its policy "
-    "and optimizer in compare_with).",
+    "held out": "Such a fit follows its training demonstrations too closely, and comparisons with it say "
+    "nothing. Take fewer options or observations, smaller networks, larger ridges "
+    "(training.optimizer.ridge), or more demonstrations.",
+    "baseline": "Comparisons with this baseline say nothing. Give it a smaller network or larger ridges (its "
+    "policy and optimizer in compare_with).",
     "marginal": "The observations do not say what the control is, or training ended too early.",
-    "flat": "Take {other}, or compare numbers of options and their networks by cross-validation (ddco-pyro select).",
+    "flat": "Take {other}, or compare numbers of options and their networks by cross-validation (ddco-pyro "
+    "select).",
     "contained": "Add ways to begin (training.starts).",
-    "few": "{count} demonstrations are too few here: each held-out one leaves {rest} to train with. Record at least "
-    "{least}, and until then take two options and the fewest observations.",
+    "few": "{count} demonstrations are too few here: each held-out one leaves {rest} to train with. Record "
+    "at least {least}, and until then take two options and the fewest observations.",
 }
 """What to do about a doubt."""
 
@@ -146,9 +124,8 @@ class Models:
         rows = [row for row in metrics.demonstrations_by_likelihood if row.part == "valid"]
         steps = np.array([row.steps for row in rows], float)
         names = list(metrics.methods)
-        held_out = {
-            name: np.array([row.log_likelihood_per_step[name] for row in rows]) * steps for name in names
-        }
+        rated = [row.log_likelihood_per_step for row in rows]
+        held_out = {name: np.array([own[name] for own in rated]) * steps for name in names}
         train = {name: one.log_likelihood_per_step.train for name, one in metrics.methods.items()}
         return cls(held_out, train, steps, {name: name for name in names}, metrics.marginal)
 
@@ -171,13 +148,11 @@ class Models:
 
     def below_marginal(self, name: str) -> bool:
         """Whether a density without observations predicts the held-out controls better."""
-        known = self.marginal
-        return (
-            known is not None and known.valid is not None and self.counts(known.valid - self.per_step(name))
-        )
+        best = None if self.marginal is None else self.marginal.valid
+        return best is not None and self.counts(best - self.per_step(name))
 
     def counts(self, nats: float) -> bool:
-        """Whether a difference in nats per step is a doubt: more than :data:`SMALLEST` for each control dimension."""
+        """Whether a difference in nats per step is a doubt: over :data:`SMALLEST` per control dimension."""
         return nats > SMALLEST * self.controls
 
     def apart(self, name: str) -> bool:
@@ -215,21 +190,17 @@ class Models:
             yield said("held out", "worse", name=called, **values), ADVICE[advice]
         elif len(self.steps) and self.below_marginal(name) and self.marginal:
             values = {"valid": number(self.per_step(name)), "marginal": number(self.marginal.valid)}
-            text = said(
-                "marginal", "worse", name=called, predict=verb(called, "predict", "predicts"), **values
-            )
+            predict = verb(called, "predict", "predicts")
+            text = said("marginal", "worse", name=called, predict=predict, **values)
             yield text, ADVICE["marginal"]
-        flats = [
-            other for other, kind in self.kinds.items() if kind in FLAT and self.kinds[name] == HIERARCHY
-        ]
+        known = self.kinds.items() if self.kinds[name] == HIERARCHY else ()
+        flats = [other for other, kind in known if kind in FLAT]
         if flats and len(self.steps):
             flat = max(flats, key=self.per_step)
             lead, other = self.lead(name, flat), method(flat) if self.kinds[flat] == flat else flat
             if self.direction(lead) == "worse":
-                by, are = (
-                    f"{number(-lead.nats_per_step)} ± {number(lead.standard_error)}",
-                    verb(called, "are", "is"),
-                )
+                by = f"{number(-lead.nats_per_step)} ± {number(lead.standard_error)}"
+                are = verb(called, "are", "is")
                 text = said("flat", "worse", name=called, are=are, other=other, by=by)
                 yield text, ADVICE["flat"].format(other=other)
 
@@ -243,19 +214,18 @@ class Models:
         clauses, held_out = [], len(self.steps)
         for other, lead in leads.items():
             way = self.direction(lead)
-            by = number(abs(lead.nats_per_step)) + (
-                f" ± {number(lead.standard_error)}" if way != "few" else ""
-            )
+            error = f" ± {number(lead.standard_error)}" if way != "few" else ""
+            by = number(abs(lead.nats_per_step)) + error
             sign: Direction = "better" if lead.nats_per_step > 0 else "worse"
             known: Direction = "unclear" if way in ("unclear", "same") else sign
             clauses.append(said("model", known, by=by, other=other, lead=with_error(lead)))
         text = f"{name} {verb(name, 'explain', 'explains')} held-out demonstrations {listed(clauses)}"
         if held_out < FEWEST:
-            held = (
-                "1 held-out demonstration is" if held_out == 1 else f"{held_out} held-out demonstrations are"
-            )
+            are = "demonstration is" if held_out == 1 else "demonstrations are"
+            held = f"{held_out} held-out {are}"
             return f"{text} ({held} too few for an error; one fit of each model)."
-        return f"{text} (± is one standard error over {held_out} held-out demonstrations, for one fit of each model)."
+        about = f"{held_out} held-out demonstrations, for one fit of each model"
+        return f"{text} (± is one standard error over {about})."
 
     def lasting(self, memory: Difference, brief: str = "") -> str:
         """The test of one fit: options that last against the mixture.
@@ -290,14 +260,8 @@ def doubts(metrics: Metrics) -> list[tuple[str, str]]:
     found = list(models.doubts(metrics.model))
     for name, one in metrics.below.items():
         if models.counts(gap := max(one.objective, one.nats)):
-            text = said(
-                "contained",
-                "worse",
-                name=ours,
-                are=verb(ours, "are", "is"),
-                other=method(name),
-                by=number(gap),
-            )
+            are, by = verb(ours, "are", "is"), number(gap)
+            text = said("contained", "worse", name=ours, are=are, other=method(name), by=by)
             found.append((text, ADVICE["contained"]))
     count = metrics.demonstrations.train
     if found and metrics.demonstrations.left_out and count < FEW:
@@ -319,9 +283,8 @@ def verdict(metrics: Metrics) -> str:
     """Everything that a run shows of its models, in sentences: doubts first, those about baselines last."""
     names = (method(name) for name, training in metrics.trainings.items() if not training.converged)
     first, last = ([" ".join(pair) for pair in pairs] for pairs in (doubts(metrics), faults(metrics)))
-    return f"{' '.join([*first, explained(metrics), tested(metrics), *last])}{rising(names)}".replace(
-        "  ", " "
-    ).strip()
+    text = " ".join([*first, explained(metrics), tested(metrics), *last])
+    return f"{text}{rising(names)}".replace("  ", " ").strip()
 
 
 def explained(metrics: Metrics) -> str:
@@ -333,7 +296,8 @@ def explained(metrics: Metrics) -> str:
         return f"{name} {fitted} fitted to all demonstrations ({value} nats per step); none was held out."
     if not metrics.comparison:
         give, value = verb(name, "give", "gives"), number(per_step.valid)
-        return f"{name} {give} held-out demonstrations {value} nats per step; no baseline was trained to compare with."
+        known = f"{name} {give} held-out demonstrations {value} nats per step"
+        return f"{known}; no baseline was trained to compare with."
     leads = {method(other): one.difference for other, one in metrics.comparison.items()}
     text = Models.of(metrics).explains(name, leads)
     left_out = "Every demonstration trains the model; each is held out from a fit without it."
@@ -349,11 +313,8 @@ def tested(metrics: Metrics) -> str:
     over = seeds.worth.get("memory") if seeds else None
     if not models.sound() or not (found or over):
         return ""
-    short = (
-        twitches(metrics.segments, metrics.control_frequency)
-        if all(own.brief for own in metrics.segments)
-        else ""
-    )
+    brief = all(own.brief for own in metrics.segments)
+    short = twitches(metrics.segments, metrics.control_frequency) if brief else ""
     if seeds and over:
         held_out = len(metrics.valid)
         errors = [error for error in seeds.standard_error["memory"] if error is not None]
@@ -399,12 +360,9 @@ def twitches(segments: Sequence[Segments], frequency: float | None) -> str:
     own, least = segments[0], "0.5 s" if frequency else "5 steps or a fiftieth of their demonstration"
     each = number(own.number / own.demonstrations, 1)
     text = f"A demonstration has {each} segments of {duration(frequency, own.median)} (the median)"
-    share = (
-        f"; {percent(own.twitches / own.number)} of all are twitches, shorter than {least}"
-        if own.often
-        else ""
-    )
-    return f"{text}{share}."
+    if own.often:
+        text += f"; {percent(own.twitches / own.number)} of all are twitches, shorter than {least}"
+    return f"{text}."
 
 
 # --- success ------------------------------------------------------------------------------------------------
@@ -416,7 +374,8 @@ def success(metrics: Metrics) -> str:
     if metrics.rollouts is None or metrics.model not in rates:
         return said("success", "few")
     ours = method(metrics.model)
-    text = f"In rollouts {ours} {verb(ours, 'succeed', 'succeeds')} in {rate(rates.pop(metrics.model), 'episodes')}"
+    often = rate(rates.pop(metrics.model), "episodes")
+    text = f"In rollouts {ours} {verb(ours, 'succeed', 'succeeds')} in {often}"
     beside = {MIXTURE: rates[MIXTURE]} if MIXTURE in rates else rates
     others = [f"{method(name)} in {rate(summary)}" for name, summary in beside.items()]
     told = f"{text}{'; ' if others else ''}{listed(others) if others else ''}."
@@ -427,7 +386,7 @@ def success(metrics: Metrics) -> str:
 
 
 def _succeeds(pair: Against, memory: Sequence[float]) -> str:
-    """The test by success: of one fit by McNemar's test, or over training seeds, with the error over episodes."""
+    """The test by success: of one fit by McNemar's test, or over training seeds, with the episodes' error."""
     lead = pair.only_ours - pair.only_theirs
     if not memory:
         way: Direction = "unclear" if pair.p_value >= 0.05 else "better" if lead > 0 else "worse"
@@ -447,7 +406,7 @@ def effort(training: Training) -> str:
 
 
 def _over_all(training: Training) -> str:
-    """The name of an optimiser whose steps are over all demonstrations, and its ridge where that was raised."""
+    """The name of an optimiser whose steps are over all demonstrations, and its ridge where it was raised."""
     ridge = "" if training.raised_ridge is None else f", ridge {training.raised_ridge:g}"
     return f"EM{ridge}" if training.by_em else "L-BFGS" if training.by_lbfgs else ""
 
@@ -457,9 +416,8 @@ def recogniser(training: Training) -> str:
     own = training.recogniser
     if own is None:
         return ""
-    return (
-        f"the controls count {own.power:g} times, the recogniser {own.weight:g} times (ridge {own.ridge:g})"
-    )
+    evidence = f"the recogniser {own.weight:g} times (ridge {own.ridge:g})"
+    return f"the controls count {own.power:g} times, {evidence}"
 
 
 def contributions(training: Training) -> dict[str, tuple[float, float]]:
@@ -499,9 +457,8 @@ def restarts(training: Training) -> str:
     told = training.restarts
     if len(told.each) == 1:
         return ""
-    stopped = {
-        number: restart.stopped for number, restart in enumerate(told.each) if restart.stopped is not None
-    }
+    each = enumerate(told.each)
+    stopped = {number: one.stopped for number, one in each if one.stopped is not None}
     early = ", ".join(f"{number} after {epochs}" for number, epochs in stopped.items()) or "none"
     ended = ", ".join(str(number) for number, restart in enumerate(told.each) if restart.diverged)
     early += f"; diverged: {ended}" if ended else ""
@@ -510,15 +467,11 @@ def restarts(training: Training) -> str:
         for n, one in enumerate(told.each)
     )
     alike = ", ".join(f"{number(one.nmi)} of {n}" for n, one in enumerate(told.each) if one.nmi is not None)
+    others = f". NMI of its segments of the training demonstrations with those of the others: {alike}"
     return (
-        f"restart {told.best} of {len(told.each)} was kept. Objectives in nats per step: {every}. Stopped early, with "
-        f"their epochs of the last stage: {early}. Together they took {told.spent.epochs} epochs "
-        f"({told.spent.gradient_steps} gradient steps)"
-        + (
-            f". NMI of its segments of the training demonstrations with those of the others: {alike}"
-            if alike
-            else ""
-        )
+        f"restart {told.best} of {len(told.each)} was kept. Objectives in nats per step: {every}. Stopped "
+        f"early, with their epochs of the last stage: {early}. Together they took {told.spent.epochs} epochs "
+        f"({told.spent.gradient_steps} gradient steps){others if alike else ''}"
     )
 
 
@@ -526,19 +479,17 @@ RAISE = "Raise training.epochs: all compared models have this budget, whatever t
 
 
 def unconverged(trainings: Mapping[str, Training]) -> list[tuple[str, str]]:
-    """Every model whose budget ended a stage before it converged, in words with the numbers, and the remedy."""
+    """Every model whose budget ended a stage before it converged, in words with numbers, and the remedy."""
     told = []
     for name, training in trainings.items():
         who, stages = method(name), []
         for stage in training.stages:
-            up = f" (tuning log-likelihood up by {number(stage.rising)} nats per step over the last {stage.over})"
+            nats = number(stage.rising)
+            up = f" (tuning log-likelihood up by {nats} nats per step over the last {stage.over})"
             if not stage.converged:
                 stages.append(f"stage {stage.stage} after {stage.epochs} epochs{up if stage.epochs else ''}")
-        first = (
-            f"Earlier stages of {who} had"
-            if training.converged
-            else f"{capital(who)} {verb(who, 'have', 'has')}"
-        )
+        has = f"{capital(who)} {verb(who, 'have', 'has')}"
+        first = f"Earlier stages of {who} had" if training.converged else has
         if stages:
             told.append((f"{first} not converged: the budget ended {listed(stages)}.", RAISE))
     return told

@@ -62,7 +62,7 @@ class Selection:
 
 
 def known_demonstrations(spec: Spec) -> Demonstrations | None:
-    """The demonstrations with the observations of every candidate; None where they have to be collected first."""
+    """The demonstrations with the observations of every candidate; None where they are not collected yet."""
     return data.known_demonstrations(grid.wide(spec))
 
 
@@ -178,6 +178,5 @@ def final_spec(chosen: Candidate) -> Spec:
     """The spec of the final fit: the chosen candidate on all demonstrations but those that are set apart."""
     if chosen.spec.demonstrations.hold_out_by not in (None, EACH):
         return chosen.spec
-    return with_overrides(
-        chosen.spec, {"demonstrations.hold_out_by": None, "demonstrations.valid_fraction": 0.0}
-    )
+    everything = {"demonstrations.hold_out_by": None, "demonstrations.valid_fraction": 0.0}
+    return with_overrides(chosen.spec, everything)

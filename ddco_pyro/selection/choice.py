@@ -23,15 +23,15 @@ from ddco_pyro.selection.grid import Candidate, point_name
 from ddco_pyro.statistics import paired
 
 RULE = (
-    "chosen: the candidate with the fewest parameters within one standard error of the best, that is, with a mean "
-    "held-out log-likelihood per step at most one standard error of the best's mean below it; the better one where "
-    "parameters are equal. A candidate that failed in a fold is not chosen"
+    "chosen: the candidate with the fewest parameters within one standard error of the best, that is, with a "
+    "mean held-out log-likelihood per step at most one standard error of the best's mean below it; the "
+    "better one where parameters are equal. A candidate that failed in a fold is not chosen"
 )
 
 STD_NOTE = (
     "control.std differs between candidates: a fixed σ rescales the log-likelihood (each step has the terms "
-    "−A log σ and −error²/2σ²), so between different σ most of a difference says how well σ fits the size of the "
-    "errors, not how well the options explain the control; compare other fields at equal σ"
+    "−A log σ and −error²/2σ²), so between different σ most of a difference says how well σ fits the size of "
+    "the errors, not how well the options explain the control; compare other fields at equal σ"
 )
 
 
@@ -95,7 +95,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Choice:
-    """All rows in the candidates' order; the ``best`` and the ``chosen`` row, None where every candidate failed."""
+    """All rows in the candidates' order; the ``best`` and the ``chosen`` row, None where all failed."""
 
     rows: Sequence[Row]
     best: Row | None
@@ -120,14 +120,11 @@ class Choice:
             if len(values) < 2 or own not in (min(values), max(values)) or (count and own == 1):
                 continue
             which = "largest" if own == max(values) else "smallest"
-            skills = (
-                "; likelihood does not count skills: it also rises where options divide a skill"
-                if count
-                else ""
-            )
+            divided = "; likelihood does not count skills: it also rises where options divide a skill"
+            skills = divided if count else ""
             yield (
-                f"{point_name({path: own})} is the best, and the {which} of the grid: the likelihood is still rising "
-                f"there, so extend the grid (selection.grid.{path}){skills}"
+                f"{point_name({path: own})} is the best, and the {which} of the grid: the likelihood is "
+                f"still rising there, so extend the grid (selection.grid.{path}){skills}"
             )
 
 
@@ -146,9 +143,8 @@ def choose(candidates: Sequence[Candidate], fits: Mapping[tuple[int, int], Metri
     complete = [row for row in scored if not row.failed]
     reference = max(complete or scored, key=lambda row: row.mean or 0.0, default=None)
     rows = [row.minus(reference) for row in rows]
-    best = next(
-        (row for row in rows if complete and reference and row.candidate is reference.candidate), None
-    )
+    likeliest = reference.candidate if complete and reference else None
+    best = next((row for row in rows if row.candidate is likeliest), None)
     within = [row for row in rows if within_one_error(row, best)]
     chosen = min(within, key=lambda row: (row.candidate.parameters, -(row.mean or 0.0)), default=None)
     return Choice(rows, best, chosen)
@@ -217,9 +213,9 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
     :param data: the contents of ``selection.json``.
     """
     intro = (
-        f"{data['folds']}-fold cross-validation over {data['demonstrations']} demonstrations, with the same folds for "
-        f"every candidate. Log-likelihood in nats: {NAT}. ± is one standard error over the folds; gradient steps are "
-        "the mean of a fold."
+        f"{data['folds']}-fold cross-validation over {data['demonstrations']} demonstrations, with the same "
+        f"folds for every candidate. Log-likelihood in nats: {NAT}. ± is one standard error over the folds; "
+        "gradient steps are the mean of a fold."
     )
     lines = [data["rule"] + "."]
     lines += [f"**Failed:** {one['name']}, fold {one['fold']}: {one['reason']}" for one in data["failed"]]
@@ -247,19 +243,11 @@ def write_figure(choice: Choice, path: Path) -> None:
         points = list(row.folds.values())
         means.append(None if row.mean is None else Interval.around(row.mean, row.error, points, colour))
         differences.append(None if row.difference is None else Interval.of(row.difference, each, colour))
+    likelihood = "held-out log-likelihood (nats per step)"
+    above = "nats per step above the best, same folds"
     panels = [
-        Panel(
-            "Each candidate, ± one standard error",
-            "held-out log-likelihood (nats per step)",
-            means,
-            band=band,
-        ),
-        Panel(
-            "Minus the best, ± one standard error",
-            "nats per step above the best, same folds",
-            differences,
-            line=0,
-        ),
+        Panel("Each candidate, ± one standard error", likelihood, means, band=band),
+        Panel("Minus the best, ± one standard error", above, differences, line=0),
     ]
     marks = "orange: chosen, the smallest within one standard error of the best (band); dots: single folds"
     notes = [line for note in choice.notes for line in textwrap.wrap(f"Note: {note}.", 150)]

@@ -1,4 +1,4 @@
-"""The candidates of a selection, one for each point of the grid, and its folds; all are checked before any fit."""
+"""The candidates of a selection, one for each point of the grid, and the folds, checked before any fit."""
 
 from __future__ import annotations
 
@@ -89,12 +89,8 @@ def candidates(spec: Spec, dimensions: Dimensions) -> list[Candidate]:
         raise SpecError(f"selection.grid: is empty; name what to try, such as selection.grid: {example}")
     shared = [path for path in grid if path.partition(".")[0] in DATA]
     if shared:
-        raise SpecError(
-            *(
-                f"selection.grid.{path}: candidates are compared on the same data; remove it"
-                for path in shared
-            )
-        )
+        why = "candidates are compared on the same data; remove it"
+        raise SpecError(*(f"selection.grid.{path}: {why}" for path in shared))
     alone: dict[str, Any] = {"selection.grid": {}, "compare_with": []}  # baselines are compared, not selected
     valid, problems = [], []
     for number, values in enumerate(product(*grid.values())):
@@ -151,9 +147,8 @@ def assign(tasks: Sequence[str], folds: int, seed: int) -> list[list[int]]:
     if folds > count:
         raise BadInput(f"selection.folds: {folds} folds of {count} demonstrations; use at most {count}")
     if count - -(-count // folds) < 2:
-        raise BadInput(
-            f"selection.folds: {folds} folds of {count} demonstrations leave less than 2 to train with"
-        )
+        known = f"{folds} folds of {count} demonstrations"
+        raise BadInput(f"selection.folds: {known} leave less than 2 to train with")
     if are_several(tasks):  # dealt to the folds in turn, task by task
         dealt = sorted(np.random.default_rng(seed).permutation(count).tolist(), key=lambda row: tasks[row])
         return [sorted(dealt[fold::folds]) for fold in range(folds)]

@@ -8,7 +8,7 @@ both become constant.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,13 +36,13 @@ LADDER = (0.5, 0.05, 0.02)
 FEW = 3
 """Segments of a demonstration, in the mean, below which they are few."""
 USUAL = 0.5
-"""Below this power gates and terminations have ridges of :data:`RIDGE`, and options may begin from windows."""
+"""Below this power gates and terminations have ridges of :data:`RIDGE`; options may begin from windows."""
 RIDGE = 100.0
 """What gates and terminations read of observations costs nothing else."""
 STEPS_A_SECOND = 10
 """Where the frequency is unknown."""
 PARTS = (1, 3)
-"""The half widths of windows are one second over these: the first, and all and none where a length is asked for."""
+"""Half widths of windows are one second over these: the first, and all and none where a length is asked."""
 STEPS = 6000
 """Steps of the demonstrations that are used, about."""
 FEWEST = 4
@@ -129,9 +129,8 @@ def lasting(spec: Spec, demos: Demonstrations, steps: float | None, on_event: On
                 values.append(event.tune)
 
         found = fit(with_overrides(sketch, overrides(spec, power, constant, window)), some, on_event=heard)
-        return Lasting(
-            power, constant, window, segments_of(found.segment(some)[0], demos.frequency), values[-1]
-        )
+        segments = segments_of(found.segment(some)[0], demos.frequency)
+        return Lasting(power, constant, window, segments, values[-1])
 
     def tried(power: float, constant: bool) -> Lasting:
         tries = [begun(power, constant, window) for window in (windows if power < USUAL else [0])]
@@ -166,9 +165,8 @@ def heavy_tails(spec: Spec, demos: Demonstrations) -> tuple[int, ...]:
     some = _some(train_and_valid(spec, demos)["train"])
     if len(some) < FEWEST:
         return ()
-    train, rest = (
-        Demonstrations(tuple(some[place] for place in range(first, len(some), 2))) for first in (0, 1)
-    )
+    places = (range(first, len(some), 2) for first in (0, 1))
+    train, rest = (Demonstrations(tuple(some[place] for place in own)) for own in places)
     usual = fit(_sketch(spec), train)
     kinds = usual.hierarchy.scaling.parts
     heavy = tuple(sorted(dim for part in kinds if part.kind == "gaussian" for dim in part.dims))
@@ -190,26 +188,21 @@ def moved(demos: Demonstrations) -> str:
     shapes = demos.observation_shapes
     in_space = [key for key, shape in shapes.items() if len(shape) == 1 and shape[0] >= 3]
     for keys in (in_space, [key for key, shape in shapes.items() if shape == (2,)]):
-        values = {
-            key: _moved([np.asarray(demo.observations[key], float) for demo in demos], demos) for key in keys
-        }
+        values = {key: _moved(key, demos) for key in keys}
         best = max(values, key=values.__getitem__, default="")
         if best and values[best] > 0:
             return best
     return ""
 
 
-def _moved(values: Sequence[np.ndarray], demos: Demonstrations) -> float:
+def _moved(key: str, demos: Demonstrations) -> float:
+    values = [np.asarray(demo.observations[key], float) for demo in demos]
     norms = np.concatenate([np.linalg.norm(array, axis=1) for array in values])
     points = [array[:, :3] for array in values]
     steps = [np.diff(path, axis=0) for path in points]
     ways = [float(np.sqrt(np.square(each).sum() * len(each))) for each in steps]
-    reach = np.mean(
-        [
-            np.linalg.norm(np.ptp(path, axis=0)) / way if way else 0.0
-            for path, way in zip(points, ways, strict=True)
-        ]
-    )
+    spans = [np.linalg.norm(np.ptp(path, axis=0)) for path in points]
+    reach = np.mean([span / way if way else 0.0 for span, way in zip(spans, ways, strict=True)])
     if np.ptp(norms) <= 1e-3 * norms.max() or reach == 0:
         return 0.0
     changes, before = np.concatenate(steps), np.concatenate([path[:-1] for path in points])
@@ -227,9 +220,8 @@ def _moved(values: Sequence[np.ndarray], demos: Demonstrations) -> float:
 
 def with_heavy_tails(spec: Spec, dims: tuple[int, ...]) -> Spec:
     """The spec with one Student t for these control dimensions, if there are any."""
-    return with_overrides(
-        spec, {"control.parts": [{"name": "heavy", "dims": dims, "kind": "student"}]} if dims else {}
-    )
+    heavy = {"control.parts": [{"name": "heavy", "dims": dims, "kind": "student"}]}
+    return with_overrides(spec, heavy if dims else {})
 
 
 def in_steps(place: str, length: str, frequency: float | None) -> float:
@@ -246,9 +238,8 @@ def in_steps(place: str, length: str, frequency: float | None) -> float:
     if not 0 < value < math.inf:
         raise BadInput(f"{place} {length}: give seconds, such as 2s, or steps, such as 20")
     if seconds and not frequency:
-        raise BadInput(
-            f"{place} {length}: the demonstrations do not say how many steps a second has; give steps"
-        )
+        why = "the demonstrations do not say how many steps a second has; give steps"
+        raise BadInput(f"{place} {length}: {why}")
     return value * frequency if seconds and frequency else value
 
 
@@ -311,7 +302,7 @@ def _off(found: Lasting, steps: float) -> float:
 
 
 def _some(demos: Demonstrations) -> Demonstrations:
-    """Demonstrations of about :data:`STEPS` steps, from all parts of their order, at least four where there are."""
+    """Demonstrations of about :data:`STEPS` steps, of all parts of their order; four or more if there are."""
     number = max(4, round(STEPS / np.mean([len(demo) for demo in demos])))
     chosen = np.unique(np.linspace(0, len(demos) - 1, number).round().astype(int))
     return Demonstrations(tuple(demos[place] for place in chosen), attributes=demos.attributes)
