@@ -1,4 +1,4 @@
-"""Controllers: a fitted hierarchy as an online policy, the AHMM run forward one step for each observation (§3)."""
+"""Controllers: a fitted hierarchy as an online policy, the AHMM run forward a step per observation (§3)."""
 
 from __future__ import annotations
 
@@ -69,10 +69,8 @@ class Controller:
         names: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> None:
         self.hierarchy, self.names = fitted(hierarchy), names
-        for name, given, known in (
-            ("control", control, ControlExecution),
-            ("options", options, OptionExecution),
-        ):
+        asked = (("control", control, ControlExecution), ("options", options, OptionExecution))
+        for name, given, known in asked:
             if given not in get_args(known):
                 raise BadInput(f"{name}={given!r}: has to be one of {', '.join(get_args(known))}")
         self.control, self.options = control, options
@@ -107,10 +105,8 @@ class Controller:
             outputs, self._states = self.hierarchy.advance(self._window.inputs(observation), self._states)
             (now,) = complete(outputs.tables(), torch.tensor([1])).steps()
             chosen = self._chosen(now, generator)
-            acting = Acting(
-                tuple(None if emission is None else emission.steps()[0] for emission in outputs.emissions),
-                chosen,
-            )
+            each = (None if own is None else own.steps()[0] for own in outputs.emissions)
+            acting = Acting(tuple(each), chosen)
             if self.control == "mean":
                 control = acting.mode
             else:

@@ -50,10 +50,9 @@ class Monitor:
 
     def reset(self) -> None:
         """Begin an episode."""
-        self._window, self._filter = Window(self.hierarchy.encoder), Filter(float(self.hierarchy.power))
-        self._alone = (
-            self._filter if self.hierarchy.recogniser is None else Filter(float(self.hierarchy.power))
-        )
+        power = float(self.hierarchy.power)
+        self._window, self._filter = Window(self.hierarchy.encoder), Filter(power)
+        self._alone = self._filter if self.hierarchy.recogniser is None else Filter(power)
         self._seen: list[Tensor] = []
         self._outputs: Outputs | None = None
         self._states: States | None = None
@@ -88,23 +87,19 @@ class Monitor:
                 tables = tables.with_evidence(recogniser.level, self._evidence(recogniser, inputs, scaled))
                 self.belief = self._filter.predict(complete(tables, ONE_STEP).steps()[0])
         levels = zip(self.names.items(), self.belief, strict=True)
-        return {
-            level: dict(zip(names, choices[0].tolist(), strict=True)) for (level, names), choices in levels
-        }
+        return {level: dict(zip(own, one[0].tolist(), strict=True)) for (level, own), one in levels}
 
     def _evidence(self, recogniser: Recogniser, inputs: Inputs, before: Tensor | None) -> Tensor:
         """What the past says of each choice, [1, 1, 1 + k].
 
         :param before: the scaled control before this step, [1, 1, A'].
         """
-        before = (
-            inputs.vector.new_zeros(1, 1, len(self.hierarchy.scaling.varying)) if before is None else before
-        )
+        if before is None:
+            before = inputs.vector.new_zeros(1, 1, len(self.hierarchy.scaling.varying))
         now = torch.cat([observed(inputs), before.double()], dim=-1)[0, 0]
         self._seen = [*self._seen, now][-1 - int(recogniser.past.widths.max()) :]
-        return (recogniser.gamma * recogniser.past.log_ratio(recogniser.past.latest(self._seen))).reshape(
-            1, 1, -1
-        )
+        ratio = recogniser.past.log_ratio(recogniser.past.latest(self._seen))
+        return (recogniser.gamma * ratio).reshape(1, 1, -1)
 
     def _scaled(self, control: np.ndarray | None) -> Tensor:
         scaling = self.hierarchy.scaling

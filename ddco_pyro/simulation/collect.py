@@ -37,10 +37,8 @@ def cache_path(task: Task, name: str, spec: DemonstrationsSpec, observed: Collec
     """
     cameras = [[camera, task.cameras[camera].digest] for camera in task.seen_by_cameras(observed)]
     package = next((point.dist for point in entry_points(group=TASKS, name=name) if point.dist), None)
-    versions = [
-        *map(importlib.metadata.version, SIMULATORS),
-        package and importlib.metadata.version(package.name),
-    ]
+    own = package and importlib.metadata.version(package.name)
+    versions = [*map(importlib.metadata.version, SIMULATORS), own]
     facts = [name, spec.supervisor, spec.count, spec.seed, cameras, versions]
     digest = hashlib.sha256(json.dumps(facts).encode())
     for source in sorted(task.sources):
@@ -70,9 +68,8 @@ def collect(
     task = find_task(task_name)
     if spec.supervisor not in task.policies:
         known = ", ".join(sorted(task.policies))
-        raise DemonstrationsError(
-            f"task {task.name!r} has no policy {spec.supervisor!r} to record (it has: {known})"
-        )
+        why = f"has no policy {spec.supervisor!r} to record (it has: {known})"
+        raise DemonstrationsError(f"task {task.name!r} {why}")
     if path is not None and path.exists():
         _refuse_others(path, task, spec)
     path = path or cache_path(task, task_name, spec, observed)
@@ -101,9 +98,8 @@ def _record(
     outcomes = []
     with robomimic_file(path, attributes, {}) as data:
         for first in range(0, len(seeds), at_once):
-            for episode in run_episodes(
-                task_name, spec.supervisor, seeds[first : first + at_once], observed=observed
-            ):
+            some = seeds[first : first + at_once]
+            for episode in run_episodes(task_name, spec.supervisor, some, observed=observed):
                 write_demonstration(data, episode.record)
                 outcomes.append(episode.outcome)
                 on_event(Counted("collecting demonstrations", spec.count, done=len(data)))
@@ -119,5 +115,6 @@ def _refuse_others(path: Path, task: Task, spec: DemonstrationsSpec) -> None:
         about = (file.attrs.get("task"), file.attrs.get("policy"))
         if about != (task.name, spec.supervisor) or {*file.get("data", ())} != names:
             raise BadInput(
-                f"{path}: is there already and does not hold these demonstrations; choose another --out or remove it"
+                f"{path}: is there already and does not hold these demonstrations; choose another --out or "
+                "remove it"
             )

@@ -101,9 +101,8 @@ def run_episodes(
     :param observed: see :func:`run_episode`, also for ``keep``.
     :raises Failed: a process died.
     """
-    calls = {
-        seed: partial(_run_named, task, policy, seed, seed in seeds[:film], observed, keep) for seed in seeds
-    }
+    run = partial(_run_named, task, policy)
+    calls = {seed: partial(run, seed, seed in seeds[:film], observed, keep) for seed in seeds}
     with run_all(calls, Workers(jobs), "ran episodes", ordered=True) as episodes:
         yield from (episode for _, episode in episodes)
 

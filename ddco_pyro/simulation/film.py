@@ -52,20 +52,15 @@ def captioned(episode: Episode, t: int, names: Sequence[Sequence[str]] = ()) -> 
     frame = np.array(episode.frames[t], order="C")
     active = episode.choices[t] if t < len(episode.choices) else episode.choices[:0].reshape(-1)
     if len(active):
-        cv2.rectangle(
-            frame, (0, 0), (frame.shape[1] - 1, frame.shape[0] - 1), option_rgb(active[0]), 2 * BORDER
-        )
+        corner = (frame.shape[1] - 1, frame.shape[0] - 1)
+        cv2.rectangle(frame, (0, 0), corner, option_rgb(active[0]), 2 * BORDER)
     shown = [name.removeprefix("option ") for name in map(option_name, active, names)] if names else active
-    text = (
-        "end"
-        if t >= len(episode.choices)
-        else f"t={t}" + "".join(f"  h{d}={h}" for d, h in enumerate(shown, 1))
-    )
+    chosen = "".join(f"  h{d}={h}" for d, h in enumerate(shown, 1))
+    text = "end" if t >= len(episode.choices) else f"t={t}{chosen}"
     white, black = (255, 255, 255), (20, 20, 20)
     for right, down, colour in ((-1, 0, white), (1, 0, white), (0, -1, white), (0, 1, white), (0, 0, black)):
-        cv2.putText(
-            frame, text, (12 + right, 26 + down), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA
-        )
+        place = (12 + right, 26 + down)
+        cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
     return frame
 
 

@@ -35,9 +35,8 @@ class GymnasiumEnvironment(dm_env.Environment):
         space = self.gymnasium.observation_space
         self._named = isinstance(space, spaces.Dict)
         observed = space.spaces if isinstance(space, spaces.Dict) else {"state": space}
-        self._observations = {
-            name: _spec(f"{id}: observation {name!r}", each) for name, each in observed.items()
-        }
+        parts = {name: (f"{id}: observation {name!r}", each) for name, each in observed.items()}
+        self._observations = {name: _spec(*part) for name, part in parts.items()}
         self._control = _spec(f"{id}: the action", self._actions)
 
     def reset(self) -> dm_env.TimeStep:
@@ -61,9 +60,8 @@ class GymnasiumEnvironment(dm_env.Environment):
 
     def _seen(self, observation: Any) -> Observation:
         named = observation if self._named else {"state": observation}
-        return {
-            name: np.asarray(named[name]).reshape(spec.shape) for name, spec in self._observations.items()
-        }
+        specs = self._observations.items()
+        return {name: np.asarray(named[name]).reshape(spec.shape) for name, spec in specs}
 
     def observation_spec(self) -> dict[str, specs.BoundedArray]:
         return self._observations
@@ -85,9 +83,8 @@ class GymnasiumEnvironment(dm_env.Environment):
         """
         picture = self.gymnasium.render()
         if picture is None:
-            raise BadInput(
-                "a film of a Gymnasium task needs Task.from_gymnasium(..., render_mode='rgb_array')"
-            )
+            known = "Task.from_gymnasium(..., render_mode='rgb_array')"
+            raise BadInput(f"a film of a Gymnasium task needs {known}")
         return np.asarray(picture, np.uint8)
 
     def close(self) -> None:

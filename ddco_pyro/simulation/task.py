@@ -120,7 +120,7 @@ class Task:
         )
 
     def watched(self, seed: int, observed: Collection[str]) -> dm_env.Environment:
-        """A fresh environment of ``load``, with the pictures of the cameras among ``observed`` as observations."""
+        """A fresh environment of ``load``, with pictures of the cameras in ``observed`` as observations."""
         names = self.seen_by_cameras(observed)
         if not names:
             return self.load(seed)
@@ -148,9 +148,8 @@ class Task:
         for name, value in outcome.items():
             if self.kind(name) == "rate" and not (value in (0.0, 1.0) or math.isnan(value)):
                 why = "a rate is 0 or 1 in every episode"
-                raise self._wrong(
-                    f"{name} is {value:g}, and {why}; make it a mean, which {SUCCESS} cannot be"
-                )
+                remedy = f"make it a mean, which {SUCCESS} cannot be"
+                raise self._wrong(f"{name} is {value:g}, and {why}; {remedy}")
         return outcome
 
     def _wrong(self, what: str) -> BadInput:
@@ -173,13 +172,11 @@ def find_task(name: str) -> Task:
     except ModuleNotFoundError as error:
         if str(error.name) in name.partition(":")[0]:
             raise BadInput(f"task {name!r} cannot be loaded: {error}") from error
-        raise BadInput(
-            f"task {name!r} needs the package {error.name!r}, which is not installed here"
-        ) from error
+            why = f"needs the package {error.name!r}, which is not installed here"
+            raise BadInput(f"task {name!r} {why}") from error
     except Exception as error:  # whatever the task's code raises
         raise BadInput(f"task {name!r} cannot be loaded: {' '.join(str(error).split())}") from error
     if not isinstance(task, Task):
-        raise BadInput(
-            f"task {name!r} leads to a {type(task).__name__}, not to a ddco_pyro.simulation.task.Task"
-        )
+        kind = type(task).__name__
+        raise BadInput(f"task {name!r} leads to a {kind}, not to a ddco_pyro.simulation.task.Task")
     return task

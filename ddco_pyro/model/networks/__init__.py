@@ -45,9 +45,8 @@ def build(spec: NetworkSpec, shape: InputShape, outputs: int | None, copies: int
             with named("over"):
                 settings["over"] = build(settings["over"], seen, None, copies)
         if "of" in settings:
-            settings["of"] = {
-                name: _branch(name, branch, seen, copies) for name, branch in settings["of"].items()
-            }
+            branches = settings["of"].items()
+            settings["of"] = {name: _branch(name, branch, seen, copies) for name, branch in branches}
         network = CLASSES[spec.network](seen, copies, **settings)
         network = network if outputs is None else network.add_head(outputs)
     if spec.inputs:

@@ -53,37 +53,29 @@ class Conv(Network):
     ) -> None:
         super().__init__()
         if not shape.images:
-            raise ShapeError(
-                "needs an image among the observations, and all of them are vectors: use network: mlp"
-            )
+            why = "all of them are vectors: use network: mlp"
+            raise ShapeError(f"needs an image among the observations, and {why}")
         self.reads, self.copies, self.pool = list(shape.vectors), copies, pool
         self.pictures = list(shape.images)
         self.activation, self.standardize = ACTIVATIONS[activation](), standardize
         pairs = list(itertools.pairwise(layers))
         firsts = [_convolution(layers[0], size[-1], copies) for size in shape.images.values()]
-        self.convolutions = nn.ModuleList(
-            nn.ModuleList(
-                [
-                    own,
-                    *(_convolution(layer, copies * above.filters, copies, copies) for above, layer in pairs),
-                ]
-            )
-            for own in firsts
-        )
+        self.convolutions = nn.ModuleList()
+        for own in firsts:
+            upper = (_convolution(layer, copies * below.filters, copies, copies) for below, layer in pairs)
+            self.convolutions.append(nn.ModuleList([own, *upper]))
         if pool == "spatial_softmax":
             with torch.no_grad():
-                for parameter in (
-                    each for layers in self._layers().values() for each in layers[-1].parameters()
-                ):
+                lasts = (layers[-1] for layers in self._layers().values())
+                for parameter in (each for layer in lasts for each in layer.parameters()):
                     parameter.mul_(SHARPNESS)
         maps = sum(self._map_features(key, own, shape.images[key]) for key, own in self._layers().items())
         self.layers = Perceptrons(copies, shape.vector + maps, hidden, dropout, activation)
 
     def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
         vector = inputs.vector.flatten(0, 1).expand(self.copies, -1, -1)
-        maps = [
-            self._maps(layers, inputs.images[key].flatten(0, 1)) for key, layers in self._layers().items()
-        ]
+        layers = self._layers().items()
+        maps = [self._maps(own, inputs.images[key].flatten(0, 1)) for key, own in layers]
         return options_last(self.layers(torch.cat([vector, *maps], dim=-1)), inputs.batch), state
 
     def numpy_form(self) -> NumpyForm:
@@ -97,9 +89,7 @@ class Conv(Network):
 
     def _layers(self) -> dict[str, list[nn.Conv2d]]:
         """The convolutions of each picture."""
-        each = (
-            [layer for layer in own.children() if isinstance(layer, nn.Conv2d)] for own in self.convolutions
-        )
+        each = ([one for one in own.children() if isinstance(one, nn.Conv2d)] for own in self.convolutions)
         return dict(zip(self.pictures, each, strict=True))
 
     def _maps(self, layers: Sequence[nn.Conv2d], image: Tensor) -> Tensor:
@@ -123,9 +113,8 @@ class Conv(Network):
                 for length in (height, width)
             )
             if min(height, width) < 1:
-                raise ShapeError(
-                    f"{key} of {size[0]} × {size[1]} is too small for its layers: take some out, or pad"
-                )
+                why = "is too small for its layers: take some out, or pad"
+                raise ShapeError(f"{key} of {size[0]} × {size[1]} {why}")
         each = {"mean": POOLED**2, "flatten": height * width, "spatial_softmax": 2}[self.pool]
         return layers[-1].out_channels // self.copies * each
 
@@ -158,7 +147,7 @@ def _shares(length: int, count: int) -> Tensor:
 
 
 def _spatial_softmax(maps: Tensor) -> Tensor:
-    """The expected place (row, column), each from -1 to 1, under the softmax of each map [..., H, W], [..., 2]."""
+    """The expected (row, column), each from -1 to 1, under each map's softmax, [..., H, W] to [..., 2]."""
     height, width = maps.shape[-2:]
     weights = maps.flatten(-2).softmax(-1).unflatten(-1, (height, width))
     rows, columns = (torch.linspace(-1, 1, length, device=maps.device) for length in (height, width))

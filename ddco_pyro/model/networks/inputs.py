@@ -90,9 +90,8 @@ class InputShape:
         for name in names:
             if name not in known:
                 there = ", ".join(known)
-                raise ShapeError(
-                    f"inputs: there is no observation {name!r}{nearest(name, known)}; there is: {there}"
-                )
+                missing = f"there is no observation {name!r}{nearest(name, known)}"
+                raise ShapeError(f"inputs: {missing}; there is: {there}")
         return InputShape(_of(self.vectors, names), _of(self.images, names), self.steps)
 
 

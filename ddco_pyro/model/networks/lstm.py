@@ -120,12 +120,8 @@ class StackedLstm(nn.Module):
 
     def _weights(self) -> Iterator[list[Tensor]]:
         for weight, bias, recurrent in zip(self.inputs.weight, self.inputs.bias, self.recurrent, strict=True):
-            yield [
-                weight.mT.contiguous(),
-                recurrent.mT.contiguous(),
-                bias[0],
-                torch.zeros_like(bias[0]),
-            ]  # for GPUs
+            none = torch.zeros_like(bias[0])
+            yield [weight.mT.contiguous(), recurrent.mT.contiguous(), bias[0], none]  # for GPUs
 
 
 def _in_windows(

@@ -1,4 +1,4 @@
-"""Stacked networks, K of them evaluated in one pass: the base class, and those that are made of perceptrons."""
+"""Stacked networks, K of them evaluated in one pass: the base class, and those made of perceptrons."""
 
 from __future__ import annotations
 
@@ -98,14 +98,8 @@ class Perceptrons(nn.Sequential):
     def numpy_form(self, of: NumpyForm) -> NumpyForm:
         """The numpy form of these layers over what ``of`` gives."""
         linear = [arrays_of(layer) for layer in self if isinstance(layer, StackedLinear)]
-        form = {
-            "kind": "perceptrons",
-            "of": of,
-            "layers": linear,
-            "hidden": self.hidden,
-            "activation": self.activation,
-        }
-        return form | {"copies": self.copies, "steps": 1}
+        form = {"kind": "perceptrons", "of": of, "layers": linear, "hidden": self.hidden}
+        return form | {"activation": self.activation, "copies": self.copies, "steps": 1}
 
 
 class Network(nn.Module):
@@ -195,14 +189,12 @@ class Constant(Mlp):
 
 
 def linear_maps(networks: Mapping[str, Network], inputs: Inputs) -> dict[str, Tensor]:
-    """What the linear networks among these give, [N, T, K, n]: one product for all that read the same vectors."""
+    """What the linear networks among these give, [N, T, K, n]: one product for all that read the same."""
     readers: dict[tuple[str, ...], dict[str, StackedLinear]] = {}
     for name, network in networks.items():
-        if (
-            isinstance(network, Mlp)
-            and network.is_linear
-            and isinstance(layer := network.layers[0], StackedLinear)
-        ):
+        if not (isinstance(network, Mlp) and network.is_linear):
+            continue
+        if isinstance(layer := network.layers[0], StackedLinear):
             readers.setdefault(tuple(network.reads), {})[name] = layer
     given: dict[str, Tensor] = {}
     for reads, layers in readers.items():

@@ -15,7 +15,7 @@ from ddco_pyro.model.networks.perceptrons import Network, State
 TRAJECTORIES, STEPS = 2, 3
 
 TOLERANCE = 1e-3
-"""Largest difference between a step alone and in its trajectory, as a part of the largest output (float32)."""
+"""Largest difference between a step alone and in its trajectory, as a part of the largest output, float32."""
 
 
 def try_network(name: str, network: Network, shape: InputShape) -> None:
@@ -42,13 +42,14 @@ def try_network(name: str, network: Network, shape: InputShape) -> None:
     if not torch.allclose(alone, whole, rtol=0.0, atol=1e-5 + TOLERANCE * largest, equal_nan=True):
         if network.initial_state(1):
             raise ShapeError(
-                f"network {name!r} gives other outputs step by step than for a whole trajectory: its state has to hold "
-                "all that it knows of earlier steps, each trajectory's apart, and of later ones it can know nothing"
+                f"network {name!r} gives other outputs step by step than for a whole trajectory: its state "
+                "has to hold all that it knows of earlier steps, each trajectory's apart, and of later ones "
+                "it can know nothing"
             )
         raise ShapeError(
-            f"network {name!r} gives a step alone other outputs than within its trajectory: it depends on earlier "
-            "steps (or later ones, other trajectories, or chance); one that remembers has to have initial_state(N), "
-            "and to be called with a state and give the next one"
+            f"network {name!r} gives a step alone other outputs than within its trajectory: it depends on "
+            "earlier steps (or later ones, other trajectories, or chance); one that remembers has to have "
+            "initial_state(N), and to be called with a state and give the next one"
         )
 
 
@@ -68,8 +69,8 @@ def _output(name: str, network: Network, inputs: Inputs, state: State | None = N
     states = _is_state(before, trajectories) and _is_state(after, trajectories)
     if not states or [tensor.shape for tensor in before] != [tensor.shape for tensor in after]:
         raise ShapeError(
-            f"network {name!r} has initial_state(N), which has to give a tuple of tensors [N, ...]; each call then "
-            f"has to give outputs and such a tuple of the same shapes, here N = {trajectories}"
+            f"network {name!r} has initial_state(N), which has to give a tuple of tensors [N, ...]; each "
+            f"call then has to give outputs and such a tuple of the same shapes, here N = {trajectories}"
         )
     found = f"shape {list(output.shape)}" if isinstance(output, Tensor) else f"a {type(output).__name__}"
     needed = [trajectories, steps, network.copies, network.features]
@@ -91,9 +92,8 @@ def _random_inputs(
 ) -> Inputs:
     """Vectors between 0 and 1, images, and numbers of steps that a network has parameters for."""
     generator, batch = torch.Generator().manual_seed(0), (trajectories, steps)
-    vectors = {
-        key: torch.rand(*batch, size, generator=generator, dtype=dtype) for key, size in shape.vectors.items()
-    }
+    sizes = shape.vectors.items()
+    vectors = {key: torch.rand(*batch, size, generator=generator, dtype=dtype) for key, size in sizes}
     images = {
         key: torch.randint(256, (*batch, *image), generator=generator, dtype=torch.uint8)
         for key, image in shape.images.items()
@@ -114,7 +114,7 @@ def _evaluating(network: Network) -> Iterator[None]:
 
 @contextmanager
 def _without_zeros(network: Network) -> Iterator[None]:
-    """Parameters that are 0 are random meanwhile: an output layer that starts at 0 would hide a memory before it."""
+    """Parameters that are 0 are random meanwhile: an output layer that starts at 0 would hide a memory."""
     generator = torch.Generator().manual_seed(1)
     kept = [(parameter, parameter.clone()) for parameter in network.parameters()]
     for parameter, values in kept:
@@ -134,10 +134,9 @@ def training_bytes(networks: Mapping[Network, InputShape]) -> int:
     Each keeps tensors until its gradient is computed. While that happens, what one network computed and its
     gradient are there too: measured with convolutions, at most twice what the largest network keeps.
     """
-    each = networks.items()
-    kept = [
-        _kept(network, shape, *_one_more(network)) - _kept(network, shape, 1, 1) for network, shape in each
-    ]
+    kept = []
+    for network, shape in networks.items():
+        kept.append(_kept(network, shape, *_one_more(network)) - _kept(network, shape, 1, 1))
     return sum(kept) + 2 * max(kept)
 
 

@@ -44,9 +44,8 @@ class UserNetwork(Network):
             module = network_class(shape, outputs, copies, **options)
         except Exception as error:  # whatever the user's code raises
             why = " ".join(str(error).split())
-            raise ShapeError(
-                f"network {name!r} cannot be made with options {dict(options)}: {why}"
-            ) from error
+            known = f"network {name!r} cannot be made with options {dict(options)}"
+            raise ShapeError(f"{known}: {why}") from error
         network = cls(module, outputs, copies)
         try_network(name, network, shape)
         return network
