@@ -172,8 +172,8 @@ def find_task(name: str) -> Task:
     except ModuleNotFoundError as error:
         if str(error.name) in name.partition(":")[0]:
             raise BadInput(f"task {name!r} cannot be loaded: {error}") from error
-            why = f"needs the package {error.name!r}, which is not installed here"
-            raise BadInput(f"task {name!r} {why}") from error
+        why = f"needs the package {error.name!r}, which is not installed here"
+        raise BadInput(f"task {name!r} {why}") from error
     except Exception as error:  # whatever the task's code raises
         raise BadInput(f"task {name!r} cannot be loaded: {' '.join(str(error).split())}") from error
     if not isinstance(task, Task):
