@@ -1,4 +1,4 @@
-"""``make release-check``: install an sdist or a wheel into an environment of its own, and use it without a clone."""
+"""``make release-check``: install an sdist or a wheel into its own environment; use it without a clone."""
 
 import argparse
 import os
@@ -32,9 +32,8 @@ def check(file: Path, packages: Path | None) -> None:
         folder = Path(name)
         venv.create(folder / "venv", with_pip=True)
         binaries = folder / "venv" / "bin"
-        environment = {
-            key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")
-        }
+        theirs = ("PYTHONPATH", "VIRTUAL_ENV")
+        environment = {key: value for key, value in os.environ.items() if key not in theirs}
 
         def run(*command: str | Path) -> None:
             print("$", *command, flush=True)
@@ -45,16 +44,8 @@ def check(file: Path, packages: Path | None) -> None:
             (site / "dependencies.pth").write_text(f"{packages.resolve()}\n")
             run("pip", "install", "-q", "--no-deps", file.resolve())
         else:
-            run(
-                "pip",
-                "install",
-                "-q",
-                "--find-links",
-                TORCH_CPU,
-                "-c",
-                ROOT / "constraints.txt",
-                file.resolve(),
-            )
+            places = ("--find-links", TORCH_CPU, "-c", ROOT / "constraints.txt")
+            run("pip", "install", "-q", *places, file.resolve())
         run("python", "-c", INSTALLED)
         run("ddco-pyro", "--version")
         run("ddco-pyro", "new", "mine.hdf5", "--out", "new", "--no-open")
@@ -66,9 +57,8 @@ def check(file: Path, packages: Path | None) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", type=Path, nargs="+")
-    parser.add_argument(
-        "--packages", type=Path, help="a folder with the dependencies, instead of installing them"
-    )
+    instead = "a folder with the dependencies, instead of installing them"
+    parser.add_argument("--packages", type=Path, help=instead)
     given = parser.parse_args()
     for one in given.files:
         check(one, given.packages)

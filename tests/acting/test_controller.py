@@ -1,4 +1,4 @@
-"""The controller against hand-set weights, the model's own means, and the latents' marginals by enumeration."""
+"""The controller against hand-set weights, the model's own means, and marginals of latents by enumeration."""
 
 from dataclasses import replace
 from functools import partial
@@ -90,26 +90,22 @@ def test_marginal_takes_the_choice_that_is_likeliest_given_all_observations(seed
 
 
 def test_marginal_adds_up_over_steps_how_likely_it_is_that_an_option_has_ended():
-    """Option 2 is begun with, ends with a probability of 0.3 a step, and only option 1 is selected from then on."""
+    """Option 2 is begun with, ends with a probability of 0.3 a step, and only option 1 is selected then."""
     hierarchy = by_hand(MEANS, [SELDOM, logit(0.3), SELDOM], [0.0, 50.0, 0.0])
     controllers = [Controller(hierarchy, options=options) for options in ("most_likely", "marginal")]
     played = [play(controller, 1)[0] for controller in controllers]
     fix(hierarchy.meta_policy.network, [[50.0, 0.0, 0.0]])
-    assert [
-        first + play(controller, 3)[0] for first, controller in zip(played, controllers, strict=True)
-    ] == [
-        [2, 2, 2, 2],
-        [2, 2, 1, 1],  # 0.7, then 0.49
-    ]
+    expected = [[2, 2, 2, 2], [2, 2, 1, 1]]  # 0.7, then 0.49
+    pairs = zip(played, controllers, strict=True)
+    assert [first + play(controller, 3)[0] for first, controller in pairs] == expected
+
+
+ONE = ((2,), ("options",))
 
 
 @pytest.mark.parametrize(
     ("counts", "emits", "network"),
-    [
-        ((2,), ("options",), "linear"),
-        ((2, 2), ("options", "control"), "linear"),
-        ((2,), ("options",), "lstm"),
-    ],
+    [(*ONE, "linear"), ((2, 2), ("options", "control"), "linear"), (*ONE, "lstm")],
 )
 def test_choices_follow_the_models_latents(counts, emits, network):
     """Over many episodes of three different states, p(h_t) is that of the AHMM without any control seen."""

@@ -29,7 +29,7 @@ STEPS, SPEED = 30, 0.125
 
 
 class ThereAndBack(dm_env.Environment):
-    """To the far end at 1 and back to 0, on which the episode ends; the position is seen and the velocity is not."""
+    """To the far end at 1 and back to 0, where the episode ends; position is seen, velocity is not."""
 
     def __init__(self, seed: int) -> None:
         self.random = np.random.default_rng(seed)

@@ -71,15 +71,13 @@ def test_a_recogniser_of_the_past_is_evidence_at_every_step(watched):
     demo, past = demos[0], hierarchy.recogniser.past
     found, value = beliefs(hierarchy, demo)
     for t, levels in enumerate(found):
-        batch = encode(Demonstrations([demo]), hierarchy.encoder, hierarchy.scaling).select(
-            torch.tensor([0]), t + 1
-        )
+        whole = encode(Demonstrations([demo]), hierarchy.encoder, hierarchy.scaling)
+        batch = whole.select(torch.tensor([0]), t + 1)
         actions = torch.cat([torch.zeros(1, 1, 2), batch.actions[:, :t]], dim=1)
         x = torch.cat([batch.inputs.vector, actions], dim=-1)[0].double()
         rows = [torch.cat([x[s], *(x[max(s - w, 0) : s + 1].mean(0) for w in (1, 2))]) for s in range(t + 1)]
-        ratio = (torch.stack(rows) @ past.weight + past.bias).log_softmax(-1).clamp(
-            min=-12
-        ) - past.share.log()
+        logits = (torch.stack(rows) @ past.weight + past.bias).log_softmax(-1)
+        ratio = logits.clamp(min=-12) - past.share.log()
         evidence = torch.cat([torch.zeros(t + 1, 1), 0.8 * ratio], dim=1)[None]
         with torch.no_grad():
             tables = hierarchy.tabulate(batch).with_evidence(2, evidence)

@@ -80,9 +80,8 @@ def test_a_folder_of_another_file_is_refused(file: Path, tmp_path: Path) -> None
     quick(tmp_path / "out", file)
     other = tmp_path / "other.hdf5"
     pick_and_place(4).write(other)
-    ended = refused(
-        f"spec.yaml: is for {file}; choose another --out", "new", other, "--out", tmp_path / "out"
-    )
+    says = f"spec.yaml: is for {file}; choose another --out"
+    ended = refused(says, "new", other, "--out", tmp_path / "out")
     ended = call("new", tmp_path / "none.hdf5", "--out", tmp_path / "new")
     assert (ended.status, ended.err.count("\n")) == (2, 1)
     assert not (tmp_path / "new").exists()

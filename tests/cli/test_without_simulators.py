@@ -33,11 +33,10 @@ for command in commands:
 
 
 def call(folder, *commands):
-    """How commands end, one after another in a process that cannot import a simulator: a line each of stderr."""
+    """How commands end, in turn in a process that cannot import a simulator: a line each of stderr."""
     command = [sys.executable, "-c", WITHOUT, json.dumps(commands)]
-    return subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=1000
-    ).stderr.splitlines()
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=1000)
+    return ended.stderr.splitlines()
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +50,8 @@ def folder(tmp_path_factory):
 def said(folder):
     """What the commands say, of one's own file and of a task that needs a simulator."""
     (folder / "task.yaml").write_text(
-        "task: needle\ndemonstrations: {count: 2}\nobservations: [gripper_pose]\nhierarchy: {levels: [{count: 2}]}\n"
+        "task: needle\ndemonstrations: {count: 2}\nobservations: [gripper_pose]\n"
+        "hierarchy: {levels: [{count: 2}]}\n"
     )
     quick = ("--set", "training.epochs=2", "--set", "compare_with=[]")
     return call(
@@ -65,9 +65,8 @@ def said(folder):
 
 
 def test_from_a_file_to_an_export(folder, said):
-    assert [line for line in said if line.startswith("status ")] == [*["status 0"] * 4, *["status 2"] * 2], (
-        said
-    )
+    ends = [line for line in said if line.startswith("status ")]
+    assert ends == [*["status 0"] * 4, *["status 2"] * 2], said
     assert (folder / "segments.html").exists()
     assert (folder / "run" / "report.html").exists()
     assert (folder / "controller" / "weights.npz").exists()

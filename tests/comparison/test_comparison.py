@@ -50,11 +50,8 @@ def other(toy_spec, cache, tmp_path_factory):
 def folders(toy_run, other):
     """The toy run, both its baselines, and a run with three options."""
     three = other(hierarchy__levels__0__count=3)
-    return [
-        toy_run.folder,
-        *(toy_run.folder / "baselines" / kind for kind in ("flat", "per_timestep")),
-        three.folder,
-    ]
+    baselines = toy_run.folder / "baselines"
+    return [toy_run.folder, baselines / "flat", baselines / "per_timestep", three.folder]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +60,7 @@ def found(folders):
 
 
 def jackknifed(values, steps):
-    """The standard error of a sum over trajectories as they happen to be drawn, by steps: leaving out each in turn."""
+    """The standard error of a sum over trajectories as they happen to be drawn, by steps: each left out."""
     n, total = len(steps), sum(steps)
     each = np.array([np.delete(values, i).sum() / np.delete(steps, i).sum() for i in range(n)])
     return total * np.sqrt((n - 1) / n * ((each - each.mean()) ** 2).sum())
@@ -95,47 +92,31 @@ def test_rows_are_what_az_compare_would_say(found, folders, held_out):
     ],
 )
 def test_the_verdict_says_whether_a_difference_is_outside_its_error(each, said):
-    """By hand, trajectories of one step: ± is the standard deviation of the four differences by the root of four."""
+    """By hand, trajectories of one step: ± is their standard deviation by the root of four."""
     apart, error = sum(each), 2 * float(np.std(each, ddof=1))
     rows = [row("a", 0, each), replace(row("b", 1, [0.0] * 4, in_training=0.1), difference=apart, dse=error)]
     found = Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "a")
     assert comparison.verdict(found) == (
-        f"a explains held-out demonstrations {said} (± is one standard error over 4 held-out demonstrations, for one "
-        "fit of each model)."
+        f"a explains held-out demonstrations {said} (± is one standard error over 4 held-out demonstrations, "
+        "for one fit of each model)."
     )
 
 
 def row(name, rank, each, model="ddco", in_training=1.0):
     mean = sum(each) / len(each)
-    return Row(
-        rank,
-        name,
-        model,
-        3,
-        sum(each),
-        0.1,
-        0.0,
-        0.0,
-        mean,
-        in_training,
-        tuple(each),
-        made_metrics().training,
-    )
+    training = made_metrics().training
+    return Row(rank, name, model, 3, sum(each), 0.1, 0.0, 0.0, mean, in_training, tuple(each), training)
 
 
 def test_a_run_that_fell_apart_comes_first_in_the_verdict():
-    """By the density without observations; nothing is concluded from its lead over a mixture that fell apart, too."""
-    runs = [
-        ("a", "flat", [4.0] * 4, 4.1),
-        ("b", "ddco", [-9.0, -8.0] * 2, 6.0),
-        ("c", "mixture", [-20.0] * 4, 5.0),
-    ]
+    """By the density without observations; nothing follows from a lead over a mixture that fell apart."""
+    runs = [("a", "flat", [4.0] * 4, 4.1), ("b", "ddco", [-9.0, -8.0] * 2, 6.0)]
+    runs.append(("c", "mixture", [-20.0] * 4, 5.0))
     rows = [row(name, rank, each, model, own) for rank, (name, model, each, own) in enumerate(runs)]
     known = Marginal(train=0.0, valid=-1.0, controls=2)
     said = comparison.verdict(Comparison(rows, tuple("klmn"), (1, 1, 1, 1), [], [], "b", known))
-    assert said.startswith(
-        "b fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training."
-    )
+    apart = "b fell apart on held-out demonstrations: −8.50 nats per step there, 6.00 in training."
+    assert said.startswith(apart)
     assert "c fell apart" in said
     assert "b is below a by 12.50 ± 0.29 nats per step" in said
     assert "options that last" not in said
@@ -156,9 +137,8 @@ def test_demonstrations_are_listed_worst_first_by_the_best_hierarchy(toy_run, fo
     assert [one["name"] for one in found.worst_first] == [held_out.names[n] for n in order]
     for one, n in zip(found.worst_first, order, strict=True):
         assert one["steps"] == held_out.lengths[n]
-        assert one["log_likelihood_per_step"] == pytest.approx(
-            {name: each[n] for name, each in values.items()}
-        )
+        expected = {name: each[n] for name, each in values.items()}
+        assert one["log_likelihood_per_step"] == pytest.approx(expected)
 
 
 def test_the_list_leads_to_the_segments_in_the_report(toy_run, toy_spec, tmp_path):
@@ -188,18 +168,13 @@ def test_demonstrations_may_be_held_out_in_another_order(folders, toy_spec, othe
     assert by_name[str(turned.folder)].each == pytest.approx(expected.tolist())
 
 
+APART = r"not held out on the same data: demo_\d+ was held out by \S+ alone; fit both with the same"
+NOTHING = r"held nothing out \(demonstrations.valid_fraction: 0\); there is"
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
-    [
-        (
-            {"seed": 1},
-            r"not held out on the same data: demo_\d+ was held out by \S+ alone; fit both with the same",
-        ),
-        (
-            {"demonstrations__valid_fraction": 0.0},
-            r"held nothing out \(demonstrations.valid_fraction: 0\); there is",
-        ),
-    ],
+    [({"seed": 1}, APART), ({"demonstrations__valid_fraction": 0.0}, NOTHING)],
     ids=["another split", "nothing held out"],
 )
 def test_runs_that_share_no_held_out_data_are_refused(folders, other, changes, reason):
@@ -226,13 +201,11 @@ def test_demonstrations_that_have_changed_since_are_refused(toy_spec, other, tmp
     second = load(shutil.copytree(first.folder, tmp_path / "second"))
     assert len(compare([first.folder, second.folder]).rows) == 2
     metrics = json.loads((first.folder / "metrics.json").read_text())
-    metrics["valid"][0]["log_likelihood"] += (
-        1  # as where the code of a user's network says another one by now
-    )
+    # as where the code of a user's network says another one by now
+    metrics["valid"][0]["log_likelihood"] += 1
     (first.folder / "metrics.json").write_text(json.dumps(metrics))
-    with pytest.raises(
-        BadInput, match=r"first: demo_\d+ has changed since this run was fitted to it; fit it"
-    ):
+    says = r"first: demo_\d+ has changed since this run was fitted to it; fit it"
+    with pytest.raises(BadInput, match=says):
         compare([first.folder, second.folder])
 
 
@@ -242,7 +215,7 @@ def test_a_run_is_not_compared_with_itself(folders):
 
 
 def test_agreement_is_that_of_each_run_on_what_was_held_out(found, folders, held_out):
-    """NMI by scikit-learn, and what the run says of its matching and of equal parts; baselines have no options."""
+    """NMI by scikit-learn, and what the run says of matching and equal parts; baselines have no options."""
     by_run = {str(folder): load(folder) for folder in (folders[0], folders[-1])}
     runs = [row.name for row in found.rows if row.name in by_run]
     phases = np.concatenate([demo.labels["phase"] for demo in held_out])
@@ -273,19 +246,16 @@ def rolled(toy_run, other, folders, tmp_path_factory):
 
 def successes(folder, method):
     with (folder / "rollouts.csv").open() as file:
-        return {
-            int(one["seed"]): float(one["success"]) for one in csv.DictReader(file) if one["method"] == method
-        }
+        rows = [one for one in csv.DictReader(file) if one["method"] == method]
+    return {int(one["seed"]): float(one["success"]) for one in rows}
 
 
 def test_rollouts_are_paired_by_initial_state(rolled):
     first, second, third = rolled
     flat = first.folder / "baselines" / "flat"
     found = compare([first.folder, flat, second.folder, third.folder])
-    outcomes = {
-        str(first.folder): successes(first.folder, "ddco"),
-        str(flat): successes(first.folder, "flat"),
-    }
+    outcomes = {str(first.folder): successes(first.folder, "ddco")}
+    outcomes[str(flat)] = successes(first.folder, "flat")
     outcomes[str(second.folder)] = successes(second.folder, "ddco")
     order = [row.name for row in found.rows if row.name in outcomes]
     assert [(one["run"], one["other"]) for one in found.rollouts] == [(order[0], name) for name in order[1:]]
@@ -308,9 +278,8 @@ def test_the_command_and_the_files_say_the_same(folders, found, tmp_path):
     assert verdict == comparison.verdict(found)
     assert place == f"comparison: {folder / 'compare.html'}"
     data = json.loads((folder / "compare.json").read_text())
-    assert [(row["name"], row["total"]) for row in data["rows"]] == [
-        (row.name, row.total) for row in found.rows
-    ]
+    totals = [(row.name, row.total) for row in found.rows]
+    assert [(row["name"], row["total"]) for row in data["rows"]] == totals
     assert data["trajectories"] == list(found.trajectories)
     text = (folder / "compare.md").read_text()
     table = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("|")]

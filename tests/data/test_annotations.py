@@ -28,12 +28,10 @@ def labels(lengths, path, known=None, **said):
     notes = import_demonstrations(source, out, choice=Choice(labels=LabelTable(path, **said))).notes
     demos = Demonstrations.read(out)
     names = json.loads(demos.attributes["label_names"])
-    found = {
-        demo.name: {
-            key: [names[key][at] if at >= 0 else "" for at in steps] for key, steps in demo.labels.items()
-        }
-        for demo in demos
-    }
+    found = {}
+    for demo in demos:
+        each = demo.labels.items()
+        found[demo.name] = {key: [names[key][at] if at >= 0 else "" for at in own] for key, own in each}
     return names, found, list(notes)
 
 
@@ -57,16 +55,15 @@ STEPS = ["", *["reach"] * 3, *["grasp"] * 2, "", ""]
     ],
 )
 def test_any_table(tmp_path, kind, names, scale, said):
-    """A label is called as its column; steps of which nothing is said, and segments without a label, are unknown."""
+    """A label is called as its column; steps of which nothing is said, segments of no label, are unknown."""
     table = pd.DataFrame(ROWS, columns=["episode", "skill", *names])
     table[list(names)] *= scale
     path = tmp_path / kind
     if kind == "a.parquet":
         table.to_parquet(path)
     else:
-        table.to_csv(
-            path, sep={"a.csv": ",", "a.tsv": "\t", "a.txt": ";"}[kind], index=False, encoding="utf-8-sig"
-        )
+        separator = {"a.csv": ",", "a.tsv": "\t", "a.txt": ";"}[kind]
+        table.to_csv(path, sep=separator, index=False, encoding="utf-8-sig")
     columns = dict(zip(("demonstration", "label", "start", "stop"), table, strict=True))
     found = labels({"demo_0": 3, "demo_1": 8}, path, columns=columns, **said)
     assert found == (
@@ -86,8 +83,8 @@ def test_labels_that_differ_by_case_or_blanks_alone_are_one(tmp_path):
     assert known == {"label": ["control", "place", "grasp", "Pick Up"]}
     assert found["demo_0"]["label"] == ["grasp"] * 4 + ["Pick Up"] * 2 + ["place"]
     assert notes == [
-        "labels/label: read 'Grasp' as 'grasp', 'grasp ' as 'grasp', 'pickup' as 'Pick Up', 'PLACE' as 'place', since "
-        "case or blanks alone differ"
+        "labels/label: read 'Grasp' as 'grasp', 'grasp ' as 'grasp', 'pickup' as 'Pick Up', 'PLACE' as "
+        "'place', since case or blanks alone differ"
     ]
 
 
@@ -108,9 +105,8 @@ def test_elan(tmp_path):
     assert found["demo_0"] == {"skill": [""] * 3, "who": [""] * 3}
 
 
-LOCATED = (
-    "Observation id\tTime offset (s)\tSubject\tBehavior\tBehavioral category\tModifier #1\tBehavior type"
-)
+LOCATED = "Observation id\tTime offset (s)\tSubject\tBehavior\tBehavioral category\tModifier #1\t"
+LOCATED += "Behavior type"
 AGGREGATED = f"""{LOCATED}\tStart (s)\tStop (s)\tDuration (s)
 demo_0\t5.0\tNo focal subject\treach\t\t\tSTATE\t5.000\t5.800\t0.800
 demo_0\t5.0\tNo focal subject\tbeep\t\t\tPOINT\t5.400\t5.400\tNA
@@ -119,9 +115,10 @@ demo_0\t5.0\tleft\tgrasp\t\t\tSTATE\t6.000\t6.300\t0.300
 """
 
 
-@pytest.mark.parametrize(
-    ("name", "text"), [("a.tsv", AGGREGATED), ("a.csv", "\ufeff" + AGGREGATED.replace("\t", ","))]
-)
+WITH_COMMAS = "\ufeff" + AGGREGATED.replace("\t", ",")
+
+
+@pytest.mark.parametrize(("name", "text"), [("a.tsv", AGGREGATED), ("a.csv", WITH_COMMAS)])
 def test_boris(tmp_path, name, text):
     (tmp_path / name).write_text(text, encoding="utf-8")
     names, found, notes = labels({"demo_0": 14, "demo_1": 2}, tmp_path / name)
@@ -151,7 +148,7 @@ EVENTS = [  # of BORIS' tabular events: behavior, modifier, what it is, time
 
 @pytest.mark.parametrize("kind", ["Behavior type", "Status"])
 def test_boris_events_are_pairs_by_behavior(tmp_path, kind):
-    """Events without a partner are named and lose nothing else. Another demonstration has events at the same times."""
+    """Events without a partner are named and lose nothing else. Another demonstration has the same events."""
     each = [(f"demo_{n}", "5", "No focal subject", *event) for event in EVENTS for n in (0, 1)]
     columns = ["Observation id", "Time offset (s)", "Subject", "Behavior", "Modifier #1", kind, "Time"]
     pd.DataFrame(each, columns=columns).to_csv(tmp_path / "a.csv", index=False)
@@ -186,22 +183,25 @@ REGIONS = [series("reach", 0, 3), series("grasp", 3, 5), series("", 6, 6)]
 """Two regions that share the sample of an edge, and one that an annotator made without a label."""
 
 
+RANGES = [{"ranges": [{"start": 1, "end": 4}], "timelinelabels": ["reach"]}]
+SERIES = [series("reach", 0.1, 0.3), series("grasp", 0.4, 0.7)]
+
+
 @pytest.mark.parametrize(
     ("regions", "unit", "said"),
     [
         (REGIONS, "steps", [*["reach"] * 3, *["grasp"] * 3, "", "", ""]),
-        ([series("reach", 0.1, 0.3), series("grasp", 0.4, 0.7)], "seconds", ["", *["reach"] * 3, *["grasp"] * 4, ""]),
-        ([{"ranges": [{"start": 1, "end": 4}], "timelinelabels": ["reach"]}], "steps", [*["reach"] * 4, *[""] * 5]),
+        (SERIES, "seconds", ["", *["reach"] * 3, *["grasp"] * 4, ""]),
+        (RANGES, "steps", [*["reach"] * 4, *[""] * 5]),
         ([{"start": 0.2, "end": 0.6, "labels": ["reach"]}], "seconds", ["", "", *["reach"] * 4, *[""] * 3]),
     ],
-)  # fmt: skip
+)
 def test_label_studio(tmp_path, regions, unit, said):
-    """Time series, whose ends are inclusive, frames of a video from 1 on, and audio; a task may have no region."""
+    """Time series with inclusive ends, frames of a video from 1 on, and audio; a task may have no region."""
     uploaded = "/data/upload/2/3f6a11c0-demo_1.csv?d=a"
     (tmp_path / "a.csv").write_text(exported((uploaded, regions), ("demo_0", []), key="csv"))
-    found = labels(
-        {"demo_0": 2, "demo_1": 9}, tmp_path / "a.csv", unit=unit, columns={"demonstration": "csv"}
-    )
+    asked = {"unit": unit, "columns": {"demonstration": "csv"}}
+    found = labels({"demo_0": 2, "demo_1": 9}, tmp_path / "a.csv", **asked)
     assert found[1] == {"demo_0": {"label": ["", ""]}, "demo_1": {"label": said}}
 
 
@@ -216,28 +216,37 @@ REACH = ("demo_1", "reach", 0.1, 0.4)
 @pytest.mark.parametrize(
     ("text", "more", "said"),
     [
-        (plain(("demo_2", "reach", 0, 1)), COLUMNS, "there is no demonstration 'demo_2' (did you mean 'demo_1'?)"),
+        (plain(("demo_2", "reach", 0, 1)), COLUMNS,
+         "there is no demonstration 'demo_2' (did you mean 'demo_1'?)"),
         (plain(REACH, ("demo_1", "grasp", 0.4, 5.3)), COLUMNS,
-         "demo_1: label: grasp lasts from step 4 to 53, but there are 12 steps; correct it, the unit or --fps"),
+         "demo_1: label: grasp lasts from step 4 to 53, but there are 12 steps; correct it, the unit or "
+         "--fps"),
         (plain(("demo_1", "place", 0.3, 0.8), REACH), COLUMNS,
          "demo_1: label: place and another segment overlap at step 3; a step has one label: end one of them"),
-        (plain(("demo_1", "grasp", 0.4, 0.41)), COLUMNS, "grasp at step 4 is shorter than a step; remove or lengthen"),
-        (plain(("demo_1", "grasp", 0.4, "00:01")), COLUMNS, "row 1: the stop '00:01' is no number; correct it"),
+        (plain(("demo_1", "grasp", 0.4, 0.41)), COLUMNS,
+         "grasp at step 4 is shorter than a step; remove or lengthen"),
+        (plain(("demo_1", "grasp", 0.4, "00:01")), COLUMNS,
+         "row 1: the stop '00:01' is no number; correct it"),
         (plain(("demo_1", "", 0, 1)), COLUMNS, "names no segment"),
         ("Observation id,Subject,Behavior,Behavior type,Time\ndemo_1,,reach,STOP,0.4\n", {},
          "names no segment; left out events without a partner (1): demo_1: reach STOP at 0.4"),
-        (plain(REACH), {}, "its columns are demonstration, label, start_s, stop_s; say what they are with --columns "
+        (plain(REACH), {},
+         "its columns are demonstration, label, start_s, stop_s; say what they are with --columns "
          "start=COLUMN,stop=COLUMN"),
-        (plain(REACH), {"columns": {"label": "skil"}}, "has no column 'skil'; there is: demonstration, label, start_s"),
-        (plain(REACH, start="start", stop="stop"), {}, "does not say the unit of its times; add --unit seconds, mill"),
+        (plain(REACH), {"columns": {"label": "skil"}},
+         "has no column 'skil'; there is: demonstration, label, start_s"),
+        (plain(REACH, start="start", stop="stop"), {},
+         "does not say the unit of its times; add --unit seconds, mill"),
         (plain(REACH, stop="stop_ms"), {"columns": {"start": "start_s", "stop": "stop_ms"}},
          "does not say the unit of its times"),
         (exported(("demo_1", REGIONS)), {}, "does not say the unit of its times"),
         (exported(("demo_1", REGIONS), tag="a/b"), {"unit": "steps"}, "'a/b' cannot be a name of labels"),
         (exported(("demo_1", [series("reach", 0, 3), series("grasp", 2, 5)])), {"unit": "steps"},
          "demo_1: label: grasp and another segment overlap at step 2"),
-        (exported(("demo_1", REGIONS), key="csv"), {}, "say what they are with --columns demonstration=COLUMN"),
-        (exported(("demo_1", [{"labels": ["a", "b"], "start": 0, "end": 1}])), {}, "has 2 labels; a step has one"),
+        (exported(("demo_1", REGIONS), key="csv"), {},
+         "say what they are with --columns demonstration=COLUMN"),
+        (exported(("demo_1", [{"labels": ["a", "b"], "start": 0, "end": 1}])), {},
+         "has 2 labels; a step has one"),
         (exported(("demo_1", [{"labels": ["a"]}])), {}, "is no table as its tool exports it, or is damaged"),
         ("", {}, "cannot be read as a table, or is damaged"),
     ],
@@ -256,9 +265,8 @@ def demos(tmp_path):
     """Two demonstrations whose labels were written by ``segment``, with other names, and no frequency."""
     path = tmp_path / "demos.hdf5"
     marks = {"skill": np.ones(12, int), "skill_boundary": np.ones(12, int), "phase": np.arange(12)}
-    each = tuple(
-        Demonstration(f"demo_{n}", {"x": np.zeros((12, 1))}, np.ones((12, 2)), marks) for n in range(2)
-    )
+    x, controls = np.zeros((12, 1)), np.ones((12, 2))
+    each = tuple(Demonstration(f"demo_{n}", {"x": x}, controls, marks) for n in range(2))
     Demonstrations(each).write(path)
     with h5py.File(path, "r+") as file:
         file.attrs["label_names"] = json.dumps({"skill": ["control", "reach"], "phase": ["a"]})
@@ -274,11 +282,8 @@ def test_labels_are_imported_beside_others(demos, tmp_path):
         names = json.loads(file.attrs["label_names"])
         assert names == {"skill": ["control", "reach", "grasp"], "phase": ["a"], "who": ["left hand"]}
         assert file.attrs["control_frequency"] == 10
-        assert set(file["data/demo_1/labels"]) == {
-            "skill",
-            "who",
-            "phase",
-        }  # boundaries of other labels are gone
+        # boundaries of other labels are gone
+        assert set(file["data/demo_1/labels"]) == {"skill", "who", "phase"}
         np.testing.assert_array_equal(file["data/demo_1/labels/skill"], [-1, 1, 1, 1, 2, 2, *[-1] * 6])
         np.testing.assert_array_equal(file["data/demo_0/labels/skill"], np.full(12, -1))
         np.testing.assert_array_equal(file["data/demo_0/labels/phase"], before["data/demo_0/labels/phase"])
@@ -295,12 +300,10 @@ def test_columns_and_the_unit_are_said(demos, tmp_path):
         assert json.loads(file.attrs["label_names"])["what"] == ["Reach", "lift"]
         assert file["data/demo_1/labels/what"][:6].tolist() == [-1, -1, 0, 0, 1, -1]
     (tmp_path / "out.hdf5").unlink()
+    unclear = "--columns demo=episode: write demonstration=COLUMN,label=COLUMN,start=COLUMN"
     for more, said in (
         ([*columns, "--unit", "seconds"], "the demonstrations do not say how long a step is; add --fps"),
-        (
-            ["--columns", "demo=episode"],
-            "--columns demo=episode: write demonstration=COLUMN,label=COLUMN,start=COLUMN",
-        ),
+        (["--columns", "demo=episode"], unclear),
         (columns, "does not say the unit of its times; add --unit seconds, milliseconds or steps"),
     ):
         refused(said, *asked, *more)
@@ -314,6 +317,5 @@ def test_a_missing_table_is_the_file_that_is_named(demos, tmp_path):
         (tmp_path / "no.csv", "is missing"),
         (tmp_path / "folder", "is a folder; give a table: CSV, TSV or Parquet"),
     ):
-        refused(
-            f": --labels {path}: {said}\n", "import", demos, "--labels", path, "--out", tmp_path / "out.hdf5"
-        )
+        asked = ("import", demos, "--labels", path, "--out", tmp_path / "out.hdf5")
+        refused(f": --labels {path}: {said}\n", *asked)

@@ -36,9 +36,8 @@ def test_pictures_are_turned_when_they_are_read(name: str, tmp_path: Path) -> No
         np.testing.assert_array_equal(np.asarray(camera), frames)
         np.testing.assert_array_equal(camera[1:4], frames[1:4])
         np.testing.assert_array_equal(camera[-1], frames[-1])
-    assert (
-        inspect(path).fields["obs/camera"].shape == read.observation_shapes["camera"] == expected[0].shape[1:]
-    )
+    shape = expected[0].shape[1:]
+    assert inspect(path).fields["obs/camera"].shape == read.observation_shapes["camera"] == shape
     import_demonstrations(path, tmp_path / "imported.hdf5")
     for frames, imported in zip(expected, stored(tmp_path / "imported.hdf5", "camera"), strict=True):
         np.testing.assert_array_equal(imported, frames)
@@ -83,9 +82,8 @@ def test_labels_of_a_column_and_discrete_actions_need_no_column(tmp_path: Path) 
         with pytest.raises(DemonstrationsError, match=r"demo_0: labels/phase (is|holds) "):
             demo_of(made, phase=broken)
     for broken in (made["actions"] > 0, made["actions"].astype(np.float32)):
-        with pytest.raises(
-            DemonstrationsError, match=r"demo_0: actions is (bool|float32) of shape \[steps\]; store"
-        ):
+        says = r"demo_0: actions is (bool|float32) of shape \[steps\]; store"
+        with pytest.raises(DemonstrationsError, match=says):
             demo_of({**made, "actions": broken})
 
 
@@ -135,21 +133,13 @@ def test_networks_read_an_observation_or_every_command_says_why_not(
     keys = ["odd"] if alone else ["pose", "odd"]
     policy = CONV if kind == "picture" and alone else {"network": "linear"}
     if kind == "picture" and not alone:
-        policy = {
-            "network": "branches",
-            "of": {"odd": CONV, "pose": {"network": "mlp", "hidden": [4]}},
-            "hidden": [4],
-        }
+        of = {"odd": CONV, "pose": {"network": "mlp", "hidden": [4]}}
+        policy = {"network": "branches", "of": of, "hidden": [4]}
     known, spec, out = {"path": str(path)}, tmp_path / "spec.yaml", tmp_path / "out"
-    spec.write_text(
-        dump_spec(small_spec((), policy, demonstrations=known, observations=keys, training={"epochs": 1}))
-    )
-    for command in (
-        ("inspect", path),
-        ("init", path, "--out", out),
-        ("check", spec),
-        ("import", path, "--out", out),
-    ):
+    own = small_spec((), policy, demonstrations=known, observations=keys, training={"epochs": 1})
+    spec.write_text(dump_spec(own))
+    to = ("--out", out)
+    for command in (("inspect", path), ("init", path, *to), ("check", spec), ("import", path, *to)):
         ended = call(*command)
         said = ended.out + ended.err + (out.read_text() if command[0] == "init" and out.exists() else "")
         out.unlink(missing_ok=True)

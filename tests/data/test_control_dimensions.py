@@ -1,4 +1,4 @@
-"""What is said of each control dimension, against counts by hand, however it is divided into demonstrations."""
+"""What is said of each control dimension, against counts by hand, however demonstrations divide it."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ STEPS = 200
 
 
 def controls() -> np.ndarray:
-    """Free; constant; a switch; at its maximum in 3 of 200 steps; in 2, which is 1 %; at both ends, in halves."""
+    """Free; constant; a switch; at its maximum in 3 of 200 steps; in 2, so 1 %; at both ends, in halves."""
     random = np.random.default_rng(0)
     found = random.uniform(-0.9, 0.9, (STEPS, 6))
     found[:, 1] = 0.3
@@ -44,13 +44,13 @@ def test_each_dimension_is_described(cuts: list[int]) -> None:
         "control dimension 1: constant (0.3): no part of the model, emitted as it is",
         "control dimension 2: takes two values, 0 and 1",
         "control dimension 3: exactly at its maximum 1 in 1.5 % of the steps",
-        "control dimension 5: exactly at its minimum -2 in 30.0 % of the steps, at its maximum 7.25 in 25.0 % of the "
-        "steps",
+        "control dimension 5: exactly at its minimum -2 in 30.0 % of the steps, at its maximum 7.25 in 25.0 "
+        "% of the steps",
     ]
 
 
 def resting(steps: int = STEPS) -> np.ndarray:
-    """At 0.25 in half of the steps; at -0 in nine tenths of these; at 0 in a tenth, at 1 and -1 as often; rounded."""
+    """At 0.25 in half of the steps; at -0 in nine tenths of these; at 0 in a tenth, 1 and -1 too; rounded."""
     random = np.random.default_rng(1)
     found = random.uniform(-0.9, 0.9, (steps, 4))
     half, tenth = np.arange(steps) % 2 == 0, np.arange(steps) % 20
@@ -65,11 +65,8 @@ def resting(steps: int = STEPS) -> np.ndarray:
 @pytest.mark.parametrize("cuts", [[], [60, 150], [99]])
 def test_a_value_inside_the_range_is_counted_and_with_whom_it_is_taken(cuts: list[int]) -> None:
     first, second, third, fourth = control_dimensions(demonstrations(resting(), cuts))
-    assert [(each.inside, each.at_inside) for each in (first, second, third)] == [
-        (0.25, 100),
-        (0.0, 90),
-        (0.0, 20),
-    ]
+    inside = [(each.inside, each.at_inside) for each in (first, second, third)]
+    assert inside == [(0.25, 100), (0.0, 90), (0.0, 20)]
     assert [each.together for each in (first, second, third)] == [(1,), (0,), ()]
     assert first.note == "exactly 0.25 in 50.0 % of the steps"
     ends = "exactly at its minimum -1 in 10.0 % of the steps, at its maximum 1 in 10.0 % of the steps"
@@ -78,7 +75,7 @@ def test_a_value_inside_the_range_is_counted_and_with_whom_it_is_taken(cuts: lis
 
 
 def rounded(dtype: type) -> np.ndarray:
-    """[200, 4]: a limit that is often reached, a switch, a rest and a constant, at times missed by rounding."""
+    """[200, 4]: a limit often reached, a switch, a rest and a constant, at times missed by rounding."""
     random = np.random.default_rng(0)
     found = random.uniform(-2.2, 2.2, (STEPS, 4))
     found[::4, 0], found[1::4, 0] = -2.4, 2.4
@@ -100,11 +97,8 @@ def test_a_limit_that_is_missed_by_rounding_is_reached(cuts: list[int], dtype: t
     assert (limit.at_minimum, limit.at_maximum, limit.inside) == (50, 50, None)
     assert (len(switch.values), rest.at_inside, still.constant) == (2, 67, True)
     parts = control_parts(ControlSpec(), found)
-    assert [(part.dims, part.kind) for part in parts] == [
-        ((0,), "clipped"),
-        ((2,), "hurdle"),
-        ((1,), "binary"),
-    ]
+    kinds = [(part.dims, part.kind) for part in parts]
+    assert kinds == [((0,), "clipped"), ((2,), "hurdle"), ((1,), "binary")]
     scaling = ControlScaling(ControlSpec(), 4, {3: still.minimum}, parts)
     scaled = scaling.scaled(demonstration)
     at = [np.isin(np.arange(STEPS) % 4, phases) for phases in ([0], [1])]
@@ -142,9 +136,7 @@ OTHERS = {
 @pytest.mark.parametrize("spoilt", [(3,), (3, 17)], ids=["one", "two"])
 @pytest.mark.parametrize("spoil", SPOILT)
 @pytest.mark.parametrize("others", OTHERS)
-def test_what_few_demonstrations_make_decides_no_kind(
-    others: str, spoil: str, spoilt: tuple[int, ...]
-) -> None:
+def test_what_few_demonstrations_make_decides_no_kind(others: str, spoil: str, spoilt) -> None:
     """It is said of whom it is; what half of them make decides the kind as it did."""
     random, spoiling = np.random.default_rng(0), SPOILT[spoil]
     made = {f"demo_{n}": OTHERS[others](random) for n in range(20)}

@@ -1,4 +1,4 @@
-"""What kind each control dimension is decided to be, what is refused, and that nothing impossible is emitted."""
+"""What kind each control dimension is found to be, what is refused, and that only the possible is emitted."""
 
 import numpy as np
 import pytest
@@ -90,10 +90,8 @@ def test_two_discrete_columns_are_a_distribution_and_act_in_exports_as_in_the_ru
         made.append(Demonstration(f"demo_{n}", {"state": whole(n) + noise}, whole(n)))
     fit = ddco_pyro.fit(spec_of(), Demonstrations(tuple(made)))
     actions = np.stack(np.meshgrid([-1, 0, 1], [0, 1, 2]), axis=-1).reshape(-1, 2)
-    each = [
-        Demonstration(f"demo_{n}", {"state": np.zeros((1, 2))}, action[None])
-        for n, action in enumerate(actions)
-    ]
+    state = {"state": np.zeros((1, 2))}
+    each = [Demonstration(f"demo_{n}", state, action[None]) for n, action in enumerate(actions)]
     np.testing.assert_allclose(np.exp(fit.log_likelihood(Demonstrations(tuple(each)))).sum(), 1.0, rtol=1e-6)
     controller = Controller(fit.hierarchy, "sample")
     controller.reset(0)
@@ -108,16 +106,16 @@ def test_parts_by_name_come_first_and_the_rest_follows():
     assert kinds(mixed(), parts=parts) == {0: "gaussian", 1: "gaussian", 2: "binary", 3: "clipped"}
 
 
+HALVES = {"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]}
+
+
 @pytest.mark.parametrize(
     ("control", "message"),
     [
         ({"kind": "binary"}, "control.kind: control dimension 0 takes more than two values; it is no switch"),
         ({"kind": "hurdle"}, "control dimension 0 is at no value inside its range in 5 % of the steps"),
         ({"parts": [{"name": "a", "dims": [9]}]}, "control.parts.0.dims: there is no control dimension 9"),
-        (
-            {"parts": [{"name": "a", "dims": [0, 2], "kind": "categorical"}]},
-            "control dimension 0 is not of whole",
-        ),
+        (HALVES, "control dimension 0 is not of whole"),
     ],
 )
 def test_what_does_not_fit_the_demonstrations_is_refused(control, message):
@@ -167,9 +165,8 @@ def resting_spec(options=3, epochs=6, **control):
 
 @pytest.fixture(scope="module")
 def rested(tmp_path_factory):
-    return ddco_pyro.fit(
-        resting_spec(2, epochs=40), resting(), out=tmp_path_factory.mktemp("runs") / "rested"
-    )
+    folder = tmp_path_factory.mktemp("runs") / "rested"
+    return ddco_pyro.fit(resting_spec(2, epochs=40), resting(), out=folder)
 
 
 def test_switches_and_bounds_are_emitted_exactly(fitted):
@@ -178,9 +175,8 @@ def test_switches_and_bounds_are_emitted_exactly(fitted):
     controls = []
     for seed in range(8):
         controller.reset(seed)
-        controls += [
-            controller.act({"state": row}) for row in np.random.default_rng(seed).normal(0, 50, (20, 5))
-        ]
+        rows = np.random.default_rng(seed).normal(0, 50, (20, 5))
+        controls += [controller.act({"state": row}) for row in rows]
     emitted = np.stack(controls)
     assert set(emitted[:, 2]) == {0.1, 0.7}
     assert set(emitted[:, 4]) == {0.1}
@@ -197,7 +193,10 @@ def run(request):
 
 
 MEASURES = {
-    "mixed": {"0": ["gaussian"], "1": ["clipped", -2.0, 2.0], "2": ["binary", 0.1, 0.7], "3": ["clipped", None, 1.0]},
+    "mixed": {
+        "0": ["gaussian"], "1": ["clipped", -2.0, 2.0], "2": ["binary", 0.1, 0.7],
+        "3": ["clipped", None, 1.0],
+    },
     "rested": {
         "0": ["hurdle", -1.0, 1.0, 0.0, [0]], "1": ["hurdle", None, None, STILL, [1, 2]],
         "2": ["hurdle", None, None, 0.0, [1, 2]], "3": ["binary", 0.0, 1.0],
@@ -208,9 +207,8 @@ MEASURES = {
 def test_what_was_decided_comes_back_from_the_run(run):
     again = ddco_pyro.load(run.folder)
     assert again.hierarchy.scaling.parts == run.hierarchy.scaling.parts
-    np.testing.assert_array_equal(
-        again.log_likelihood(run.demonstrations), run.log_likelihood(run.demonstrations)
-    )
+    before, after = (one.log_likelihood(run.demonstrations) for one in (run, again))
+    np.testing.assert_array_equal(after, before)
     assert again.metrics.measure == MEASURES[run.folder.name]
     assert again.metrics.engine_check.value < 1e-6
 
@@ -225,9 +223,8 @@ def test_exports_act_as_the_run_does(run, tmp_path, control):
     seen = np.random.default_rng(3).normal(0, 1.5, (150, *size))
     ours, theirs = (np.stack([acts.act({"state": row}) for row in seen]) for acts in (exported, original))
     np.testing.assert_allclose(ours, theirs, atol=1e-5)
-    np.testing.assert_array_equal(
-        np.where(np.isin(ours, exact), ours, 9), np.where(np.isin(theirs, exact), theirs, 9)
-    )
+    kept = (np.where(np.isin(each, exact), each, 9) for each in (ours, theirs))
+    np.testing.assert_array_equal(*kept)
     if run.folder.name == "rested":
         rests = ours[:, 1] == STILL
         assert 0.1 < rests.mean() < 0.9
@@ -243,9 +240,8 @@ def in_file(spec, path, **changes):
 
 def test_a_value_that_a_switch_does_not_have_is_one_line(fitted):
     broken = demonstrations(lambda n: np.where(np.arange(5) == 2, 0.5, mixed(n)), number=1)
-    with pytest.raises(
-        DemonstrationsError, match=r"2 is 0\.5 at step 0, .*; repair it, or leave demo_0 out$"
-    ):
+    says = r"2 is 0\.5 at step 0, .*; repair it, or leave demo_0 out$"
+    with pytest.raises(DemonstrationsError, match=says):
         fitted.log_likelihood(broken)
 
 
@@ -255,11 +251,8 @@ def test_different_measures_are_not_ranked(fitted, tmp_path):
     runs = []
     for kind in ("auto", "gaussian"):
         runs.append(ddco_pyro.fit(in_file(spec_of(kind=kind), path), out=tmp_path / kind).folder)
-    refused(
-        "control dimension 1 is clipped with bounds -2 and 2 in one and gaussian in the other",
-        "compare",
-        *runs,
-    )
+    says = "control dimension 1 is clipped with bounds -2 and 2 in one and gaussian in the other"
+    refused(says, "compare", *runs)
     grid = in_file(spec_of(), path, selection={"folds": 2, "grid": {"control.kind": ["auto", "gaussian"]}})
     (tmp_path / "grid.yaml").write_text(dump_spec(grid))
     said = "kind = auto and kind = gaussian measure different things: control dimension 1"
@@ -296,7 +289,7 @@ def test_without_skill_options_gain_nothing(at_once):
 
 
 def test_scaling_keeps_exactly_the_value_apart(rested):
-    """Numbers that differ by rounding are the value, others are not, and what is scaled comes back exactly."""
+    """Numbers that differ by rounding are the value, others are not, and what is scaled comes back exact."""
     scaling = rested.hierarchy.scaling
     rows = np.tile([0.0, STILL, 0.0, 1.0], (5, 1))
     rows[1:, 1] = np.nextafter(STILL, -1), np.nextafter(STILL, 1), STILL * (1 - 1e-6), STILL * (1 + 1e-6)

@@ -44,11 +44,8 @@ def test_a_file_of_robomimics_is_read_as_it_is() -> None:
         for demo in demos:
             np.testing.assert_array_equal(demo.actions, file[f"data/{demo.name}/actions"])
             np.testing.assert_array_equal(demo.observations["object"], file[f"data/{demo.name}/obs/object"])
-    assert demos.observation_shapes == {
-        "agentview_image": (12, 10, 3),
-        "object": (2,),
-        "robot0_eef_pos": (2,),
-    }
+    shapes = {"agentview_image": (12, 10, 3), "object": (2,), "robot0_eef_pos": (2,)}
+    assert demos.observation_shapes == shapes
     assert set(demos.masks) == {"train", "valid", "better"}
     assert inspect(ROBOMIMIC).frequency == 20
 
@@ -103,9 +100,8 @@ def test_lerobot_without_its_videos(out: Path) -> None:
     for episode, demo in enumerate(demos):
         steps = np.arange(len(demo))
         np.testing.assert_array_equal(demo.observations["state"][:, :2], [[episode, step] for step in steps])
-        np.testing.assert_allclose(
-            demo.actions, np.stack([0.1 * steps, np.full(len(demo), -0.1 * episode)], 1), 1e-6
-        )
+        expected = np.stack([0.1 * steps, np.full(len(demo), -0.1 * episode)], 1)
+        np.testing.assert_allclose(demo.actions, expected, 1e-6)
         picture = demo.observations["images/wrist"]
         assert (picture[..., 0] == 50 * episode).all()
         assert (picture[:, 0, 0, 1:] == 10 * steps[:, None]).all()
@@ -169,19 +165,16 @@ def test_what_is_not_chosen_is_not_read(change: odd.Change, tmp_path: Path, out:
 
 
 @pytest.mark.parametrize("index", [True, False], ids=["an index of pandas", "a column"])
-def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(
-    index: bool, tmp_path: Path, out: Path
-) -> None:
-    """Subtasks have a table of names, of which one number is missing; the task of the last episode changes."""
+def test_lerobots_tasks_and_subtasks_are_labels_with_names(index: bool, tmp_path: Path, out: Path) -> None:
+    """Subtasks have a table of names, of which one number is missing; the last episode's task changes."""
     column = "__index_level_0__" if index else "subtask"
     names = pyarrow.table({"subtask_index": [2, 0], column: ["lift", "reach"]})
 
     def framed(table: pyarrow.Table) -> pyarrow.Table:
         tasks = table["task_index"].to_pylist()
         tasks[-3:] = [0, 0, 0]
-        table = table.set_column(
-            table.schema.get_field_index("task_index"), "task_index", pyarrow.array(tasks)
-        )
+        place = table.schema.get_field_index("task_index")
+        table = table.set_column(place, "task_index", pyarrow.array(tasks))
         return table.append_column("subtask_index", pyarrow.array([2 * (n % 2) for n in range(len(table))]))
 
     def both(table: pyarrow.Table) -> pyarrow.Table:
@@ -201,27 +194,24 @@ def test_lerobots_tasks_and_subtasks_of_frames_are_labels_with_names(
     assert demos[0].labels["subtask"].tolist() == [0, 2, 0, 2, 0]
 
 
+NO_VIDEO = r"file-000\.mp4: the video is missing; leave its observation"
+SMALLER = odd.feature("observation.images.top", dtype="video", shape=[11, 12, 3])
+
+
+def cut(dataset: Path) -> None:
+    (dataset / odd.DATA).write_bytes((dataset / odd.DATA).read_bytes()[:-100])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda dataset: (dataset / odd.VIDEO).unlink(),
-            r"file-000\.mp4: the video is missing; leave its observation",
-        ),
-        (
-            odd.feature("observation.images.top", dtype="video", shape=[11, 12, 3]),
-            r"mp4: is \d+ x \d+, and meta/info",
-        ),
-        (
-            lambda dataset: (dataset / odd.DATA).write_bytes((dataset / odd.DATA).read_bytes()[:-100]),
-            r"demo_0: cannot be read, or is damaged",
-        ),
+        (lambda dataset: (dataset / odd.VIDEO).unlink(), NO_VIDEO),
+        (SMALLER, r"mp4: is \d+ x \d+, and meta/info"),
+        (cut, r"demo_0: cannot be read, or is damaged"),
     ],
     ids=["no video", "small video", "damaged data"],
 )
-def test_a_damaged_lerobot_dataset_is_refused(
-    tmp_path: Path, out: Path, change: odd.Change, message: str
-) -> None:
+def test_a_damaged_lerobot_dataset_is_refused(tmp_path: Path, out: Path, change: odd.Change, message) -> None:
     dataset = odd.changed(change)(tmp_path)
     with pytest.raises(DemonstrationsError, match=message):
         import_demonstrations(dataset, out, choice=Choice(videos=True))
@@ -252,9 +242,8 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         random = np.random.default_rng(0)
         arm = spaces.Dict({"joints": spaces.Box(-9, 9, (3,), np.float64)})
         camera = spaces.Box(0, 255, (32, 32, 3), np.uint8)
-        space = spaces.Dict(
-            {"arm": arm, "camera": camera, "goal": spaces.Discrete(4), "mission": spaces.Text(30)}
-        )
+        others = {"goal": spaces.Discrete(4), "mission": spaces.Text(30)}
+        space = spaces.Dict({"arm": arm, "camera": camera, **others})
         action.seed(0)
         buffers = []
         for episode in range(4):
@@ -267,14 +256,10 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             }
             actions = batched([action.sample() for _ in range(steps)])
             ends = np.arange(steps) == steps - 1
-            buffers.append(
-                EpisodeBuffer(
-                    episode, 7 + episode, None, observations, actions, np.ones(steps), ends, ~ends, {}
-                )
-            )
-        minari.create_dataset_from_buffers(
-            "arm/reach-v0", buffers, observation_space=space, action_space=action
-        )
+            known = (episode, 7 + episode, None, observations, actions)
+            buffers.append(EpisodeBuffer(*known, np.ones(steps), ends, ~ends, {}))
+        given = {"observation_space": space, "action_space": action}
+        minari.create_dataset_from_buffers("arm/reach-v0", buffers, **given)
         return tmp_path / "arm" / "reach-v0", buffers
 
     return make
@@ -282,21 +267,18 @@ def written_by_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_minari(written_by_minari, out: Path) -> None:
     folder, buffers = written_by_minari(spaces.Box(-1, 1, (2,)))
-    assert import_demonstrations(folder, out).notes == (
-        "networks do not read obs/mission: it holds text, not numbers",
-    )
+    note = "networks do not read obs/mission: it holds text, not numbers"
+    assert import_demonstrations(folder, out).notes == (note,)
     assert "obs/mission holds text, not numbers" in inspect(folder).problems
     demos = Demonstrations.read(out)
     assert demos.lengths == (5, 6, 7, 8)
     for buffer, demo in zip(buffers, demos, strict=True):
         np.testing.assert_array_equal(demo.actions, buffer.actions)
-        np.testing.assert_array_equal(
-            demo.observations["arm/joints"], buffer.observations["arm"]["joints"][:-1]
-        )
+        joints = buffer.observations["arm"]["joints"][:-1]
+        np.testing.assert_array_equal(demo.observations["arm/joints"], joints)
         np.testing.assert_array_equal(demo.observations["goal"][:, 0], buffer.observations["goal"][:-1])
-        np.testing.assert_allclose(
-            demo.observations["camera"], buffer.observations["camera"][:-1], atol=2
-        )  # JPEG
+        pictures = buffer.observations["camera"][:-1]
+        np.testing.assert_allclose(demo.observations["camera"], pictures, atol=2)  # JPEG
         assert demo.attributes["seed"] == buffer.seed
     for other in (folder / "data", folder / "data" / "main_data.hdf5"):
         assert inspect(other).format == "minari"
@@ -315,17 +297,15 @@ def test_minari_with_nested_actions(written_by_minari, out: Path) -> None:
     out.unlink()
     import_demonstrations(folder, out, choice=Choice(actions=("hands/0", "arm/base")))
     np.testing.assert_array_equal(Demonstrations.read(out)[3].actions, np.hstack([grasp[:, None], base]))
-    with pytest.raises(
-        DemonstrationsError, match=r"no action 'hand/0' \(did you mean 'hands/0'\?\); there is: arm"
-    ):
+    says = r"no action 'hand/0' \(did you mean 'hands/0'\?\); there is: arm"
+    with pytest.raises(DemonstrationsError, match=says):
         import_demonstrations(folder, out.with_name("x"), choice=Choice(actions=("hand/0",)))
 
 
 def test_minaris_text_is_no_control(written_by_minari, out: Path) -> None:
     folder, _ = written_by_minari(spaces.Dict({"jaw": spaces.Box(-1, 1, (1,)), "say": spaces.Text(5)}))
-    with pytest.raises(
-        DemonstrationsError, match=r"demo_0: say holds <U5, not numbers; name the control with"
-    ):
+    says = r"demo_0: say holds <U5, not numbers; name the control with"
+    with pytest.raises(DemonstrationsError, match=says):
         import_demonstrations(folder, out)
     import_demonstrations(folder, out, choice=Choice(actions=("jaw",)))
     assert Demonstrations.read(out).control_size == 1
@@ -338,9 +318,8 @@ def test_minaris_environment_is_never_made(written_by_minari, out: Path) -> None
     metadata = json.loads(path.read_text())
     del metadata["observation_space"]
     path.write_text(json.dumps(metadata | {"env_spec": '{"id": "x-v0", "entry_point": "antigravity:x"}'}))
-    with pytest.raises(
-        DemonstrationsError, match=r"metadata\.json does not say its observation and action spaces"
-    ):
+    says = r"metadata\.json does not say its observation and action spaces"
+    with pytest.raises(DemonstrationsError, match=says):
         import_demonstrations(folder, out)
 
 
@@ -365,9 +344,8 @@ def test_minaris_episodes_and_steps_are_counted(written_by_minari, out: Path) ->
         assert message in left_out[name]
     with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
         del file["episode_1"]
-    with pytest.raises(
-        DemonstrationsError, match="counts 4 episodes, and the dataset has 3; correct total_episodes"
-    ):
+    says = "counts 4 episodes, and the dataset has 3; correct total_episodes"
+    with pytest.raises(DemonstrationsError, match=says):
         inspect(folder)
 
 
@@ -376,7 +354,7 @@ def test_minaris_episodes_and_steps_are_counted(written_by_minari, out: Path) ->
 
 @pytest.fixture
 def surgeons(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
-    """The folder of a task in the official layout, and its trials: each instrument moves half as far as its master."""
+    """A task's folder in the official layout, and trials: instruments move half as far as their masters."""
     folder, random, trials = tmp_path / "Knot_Tying", np.random.default_rng(0), []
     for part in ("kinematics/AllGestures", "transcriptions"):
         (folder / part).mkdir(parents=True)
@@ -388,9 +366,8 @@ def surgeons(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
         trials.append(rows.round(8))
     (folder / "transcriptions" / "Knot_Tying_B001.txt").write_text("3 12 G12 \n13 30 G2 \n")
     (folder / "transcriptions" / "Knot_Tying_C002.txt").write_text("1 24 G11\n\n")
-    (folder / "meta_file_Knot_Tying.txt").write_text(
-        "Knot_Tying_B001\t\tN\t\t13\t\t2\nKnot_Tying_C002\t\tE\t\t20\n\n"
-    )
+    meta = "Knot_Tying_B001\t\tN\t\t13\t\t2\nKnot_Tying_C002\t\tE\t\t20\n\n"
+    (folder / "meta_file_Knot_Tying.txt").write_text(meta)
     return folder, trials
 
 
@@ -431,35 +408,21 @@ def test_a_source_at_a_lower_rate(surgeons, out: Path) -> None:
     assert inspect(out).frequency == 10
 
 
+WORDS, NUMBERS = "transcriptions/Knot_Tying_B001.txt", "kinematics/AllGestures/Knot_Tying_B001.txt"
+OTHER_RATE = "--hz 20: the source has 30 Hz; give a whole part of that, such as 15, 10, 7.5, 6"
+
+
 @pytest.mark.parametrize(
     ("change", "more", "message"),
     [
-        (
-            ("transcriptions/Knot_Tying_B001.txt", "3 x G12"),
-            (),
-            "Knot_Tying_B001.txt: row 1 is no FIRST LAST GESTURE",
-        ),
-        (("kinematics/AllGestures/Knot_Tying_B001.txt", ""), (), "Knot_Tying_B001.txt is empty"),
-        (
-            ("kinematics/AllGestures/Knot_Tying_B001.txt", "1 2"),
-            (),
-            "rows of 2 numbers, where JIGSAWS has 76",
-        ),
-        (
-            ("kinematics/AllGestures/Knot_Tying_B001.txt", "1 a"),
-            (),
-            "Knot_Tying_B001.txt is no table of numbers",
-        ),
-        (
-            None,
-            ("--hz", "20"),
-            "--hz 20: the source has 30 Hz; give a whole part of that, such as 15, 10, 7.5, 6",
-        ),
+        ((WORDS, "3 x G12"), (), "Knot_Tying_B001.txt: row 1 is no FIRST LAST GESTURE"),
+        ((NUMBERS, ""), (), "Knot_Tying_B001.txt is empty"),
+        ((NUMBERS, "1 2"), (), "rows of 2 numbers, where JIGSAWS has 76"),
+        ((NUMBERS, "1 a"), (), "Knot_Tying_B001.txt is no table of numbers"),
+        (None, ("--hz", "20"), OTHER_RATE),
     ],
 )
-def test_what_is_wrong_with_surgeons_files_is_one_line(
-    surgeons, out: Path, change, more, message: str
-) -> None:
+def test_what_is_wrong_with_surgeons_files_is_one_line(surgeons, out: Path, change, more, message) -> None:
     folder, _ = surgeons
     if change:
         (folder / change[0]).write_text(change[1])
@@ -474,9 +437,7 @@ class Stopped(Exception):
     pass
 
 
-def test_an_interrupted_import_leaves_nothing_and_one_that_is_there_is_not_replaced(
-    out: Path, tmp_path: Path
-) -> None:
+def test_an_interrupted_import_leaves_nothing_and_replaces_nothing(out: Path, tmp_path: Path) -> None:
     def stop(event: Counted) -> None:
         if event.done == 3:
             raise Stopped
@@ -514,26 +475,20 @@ def test_broken_demonstrations_are_refused_or_left_out(tmp_path: Path, out: Path
     assert (demos.names, demos.masks) == (("demo_0", "demo_2", "demo_4"), {"valid": ("demo_2",)})
 
 
+NO_MASK = "there is no mask 'bettr' (did you mean 'better'?); there is: better, train, valid"
+NO_KEY = "demo_0: there is no observation 'objct' (did you mean 'object'?); there is: "
+NO_FORMAT = "there is no format 'roboimic' (did you mean 'robomimic'?); there is: lerobot, "
+ONE_CONTROL = "has the format robomimic, with one control; --action is for the folder of a Le"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["--mask", "bettr"],
-            "there is no mask 'bettr' (did you mean 'better'?); there is: better, train, valid",
-        ),
-        (
-            ["--observation", "objct"],
-            "demo_0: there is no observation 'objct' (did you mean 'object'?); there is: ",
-        ),
+        (["--mask", "bettr"], NO_MASK),
+        (["--observation", "objct"], NO_KEY),
         (["--format", "lerobot"], "info.json: cannot be read, or is damaged"),
-        (
-            ["--format", "roboimic"],
-            "there is no format 'roboimic' (did you mean 'robomimic'?); there is: lerobot, ",
-        ),
-        (
-            ["--action", "actions"],
-            "has the format robomimic, with one control; --action is for the folder of a Le",
-        ),
+        (["--format", "roboimic"], NO_FORMAT),
+        (["--action", "actions"], ONE_CONTROL),
         (["--image-size", "3"], "Invalid value for '--image-size'"),
     ],
 )

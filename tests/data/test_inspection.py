@@ -31,18 +31,16 @@ def path(tmp_path: Path) -> Path:
     return found
 
 
+WITHIN = json.dumps({"env_kwargs": {"control_freq": 40}})
+BESIDE = json.dumps({"control_freq": 40, "env_kwargs": None})
 RATES: dict[str, tuple[str, object, float | None]] = {
     "its own": ("", {"control_frequency": 25}, 25),
     "before others": ("", {"fps": 30, "control_frequency": 25.0}, 25),
     "of a demonstration": ("data/demo_0", {"fps": 15}, 15),
     "text": ("data", {"fps": "50 Hz"}, 50),
     "a period": ("", {"dt": 0.02}, 50),
-    "of the environment": ("data", {"env_args": json.dumps({"env_kwargs": {"control_freq": 40}})}, 40),
-    "beside the environment": (
-        "data",
-        {"env_args": json.dumps({"control_freq": 40, "env_kwargs": None})},
-        40,
-    ),
+    "of the environment": ("data", {"env_args": WITHIN}, 40),
+    "beside the environment": ("data", {"env_args": BESIDE}, 40),
     "none": ("", {"fps": 0}, None),
     "no number": ("", {"fps": "fast", "hz": float("nan"), "rate": True, "dt": float("inf")}, None),
 }
@@ -57,9 +55,8 @@ def test_the_rate_is_read_under_usual_names(
         (file[place] if place else file).attrs.update(said)
     assert inspect(path).frequency == hertz
     shown = call("inspect", path).out
-    assert (
-        f"control frequency: {hertz:g} Hz\n" if hertz else 'file.attrs["control_frequency"] = 20 says'
-    ) in shown
+    unknown = 'file.attrs["control_frequency"] = 20 says'
+    assert (f"control frequency: {hertz:g} Hz\n" if hertz else unknown) in shown
 
 
 def test_shapes_ranges_lengths_and_constants(path: Path) -> None:
@@ -101,7 +98,8 @@ def test_what_a_fit_would_refuse_is_said_with_its_place(path: Path) -> None:
         "demo_1: obs/goal has 2 steps, but actions has 4",
         "demo_2: actions is missing; there is: labels/phase, obs/camera, obs/fixed, obs/goal, obs/pose",
         "mask/valid: there is no demonstration 'demo_9' (did you mean 'demo_4'?)",
-        "obs/goal has 0 NaN and 2 infinite values, the first in demo_4 at step 2; 1 of 3 demonstrations is affected",
+        "obs/goal has 0 NaN and 2 infinite values, the first in demo_4 at step 2; 1 of 3 demonstrations is "
+        "affected",
         "obs/pose has 1 NaN and 0 infinite values and 4 beyond ±1e+30, the first in demo_3 at step 2; 2 of 4 "
         "demonstrations are affected",
     ]
@@ -114,10 +112,8 @@ def test_the_command_shows_it_and_a_spec(path: Path) -> None:
     assert (ended.status, ended.err) == (0, "")
     assert "robomimic, 5 demonstrations of 3 to 6 steps (median 4, 21 in all)" in ended.out
     assert "control frequency: 20 Hz" in ended.out
-    rows = {
-        line.split("│")[0].strip(): [c.strip() for c in line.split("│")[1:]]
-        for line in ended.out.splitlines()
-    }
+    lines = [line.split("│") for line in ended.out.splitlines()]
+    rows = {name.strip(): [cell.strip() for cell in cells] for name, *cells in lines}
     assert rows["obs/fixed"] == ["[3]", "float32", "1 to 3", "constant"]
     assert rows["actions"][-1] == "constant: 1"
     assert "observations:" in ended.out
@@ -132,21 +128,18 @@ def test_markup_in_names_is_shown_as_it_is(path: Path) -> None:
     assert "obs/[red]x[/red]" in call("inspect", path).out
 
 
+TWICE = "1 of 5 demonstrations equal another one, the first demo_4, which equals demo_0: one of"
+PADDED = "control dimension 2: exactly 0 in 29.4 % of the steps; exactly at its minimum -1 in 47.1"
+CONVENTIONS = "control dimension 2: exactly 0 in 17.6 % of the steps; exactly at its minimum -1 in"
 NOTES: dict[str, list[str]] = {
     "equal tails": [
         "control dimension 0: -0.30100668315876145 is common in demo_2 alone",
         "control dimension 1: -0.38171402837921675 is common in demo_3 alone",
     ],
-    "a demonstration twice": [
-        "1 of 5 demonstrations equal another one, the first demo_4, which equals demo_0: one of"
-    ],
+    "a demonstration twice": [TWICE],
     "an observation that is the control": ["obs/command is control dimensions 0-1 at the same step, up to"],
-    "a switch padded by zeros": [
-        "control dimension 2: exactly 0 in 29.4 % of the steps; exactly at its minimum -1 in 47.1"
-    ],
-    "two conventions of a switch": [
-        "control dimension 2: exactly 0 in 17.6 % of the steps; exactly at its minimum -1 in"
-    ],
+    "a switch padded by zeros": [PADDED],
+    "two conventions of a switch": [CONVENTIONS],
     "integers -1, 0, 1": [],
     "demonstrations of one step": [],
     "channels first": [],
@@ -160,7 +153,7 @@ def test_what_coincides_is_noted_once(name: str, notes: list[str], tmp_path: Pat
 
 
 @pytest.mark.parametrize(("shift", "left_out"), [(-1, False), (0, True), (1, True)])
-def test_a_control_among_other_numbers_is_noted_and_alone_left_out(
+def test_a_control_among_others_is_noted_and_alone_left_out(
     shift: int, left_out: bool, tmp_path: Path
 ) -> None:
     """It is that of the step before, of the same one, or of the next; beside it is a number of its own."""
@@ -187,9 +180,8 @@ def test_a_control_among_other_numbers_is_noted_and_alone_left_out(
 
 def test_copies_are_noted_where_the_masks_part_them(tmp_path: Path) -> None:
     def noted(**masks: list[bytes]) -> bool:
-        return any(
-            "equal another one" in note for note in inspect(write(tmp_path / "d.hdf5", twins, masks)).notes
-        )
+        notes = inspect(write(tmp_path / "d.hdf5", twins, masks)).notes
+        return any("equal another one" in note for note in notes)
 
     assert noted(valid=[b"demo_0"])
     assert noted(train=[b"demo_0", b"demo_1"], valid=[b"demo_4"])
@@ -246,9 +238,7 @@ ODD: dict[str, tuple[Spoil, str]] = {
 
 @pytest.mark.parametrize(("name", "spoilt"), [("dead", (3,)), *((name, (3, 11)) for name in ODD)])
 @pytest.mark.usefixtures("undecided")
-def test_an_odd_demonstration_is_named_and_left_out(
-    name: str, spoilt: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_an_odd_demonstration_is_named_and_left_out(name: str, spoilt, tmp_path: Path) -> None:
     spoil, why = ODD[name]
     path = recorded(tmp_path / "demos.hdf5", spoil, spoilt)
     names = [f"demo_{number}" for number in spoilt]
@@ -272,7 +262,8 @@ def test_a_period_in_milliseconds_is_asked_about(tmp_path: Path) -> None:
     path = write(tmp_path / "demos.hdf5")
     with h5py.File(path, "r+") as file:
         file.attrs["dt"] = 33
-    line = 'a step lasts 33 s by the file: if its dt is in milliseconds, write file.attrs["control_frequency"] = 30.3'
+    line = "a step lasts 33 s by the file: if its dt is in milliseconds, write "
+    line += 'file.attrs["control_frequency"] = 30.3'
     assert line in inspect(path).notes
     with h5py.File(path, "r+") as file:
         file.attrs["dt"] = 2

@@ -25,9 +25,8 @@ def zeros(
     group: h5py.Group, place: str, shape: tuple[int, ...], chunk: tuple[int, ...], dtype: str = "f8"
 ) -> None:
     """An array of zeros that is really there: every chunk of it is stored, compressed to a thousandth."""
-    dataset = group.create_dataset(
-        place, shape, dtype, chunks=chunk, maxshape=(None, *shape[1:]), compression="gzip"
-    )
+    stored = {"chunks": chunk, "maxshape": (None, *shape[1:]), "compression": "gzip"}
+    dataset = group.create_dataset(place, shape, dtype, **stored)
     stored = zlib.compress(bytes(int(np.prod(chunk)) * dataset.dtype.itemsize), 1)
     for start in np.ndindex(*(-(-size // part) for size, part in zip(shape, chunk, strict=True))):
         dataset.id.write_direct_chunk(tuple(np.multiply(start, chunk)), stored)
@@ -55,17 +54,11 @@ def spec_of(path: Path, *observations: str) -> Path:
 
 
 def test_a_fit_to_what_is_larger_than_memory_is_refused(tmp_path: Path) -> None:
-    """8 GB in a file of a few megabytes: 28 bytes for each observation and control of a step, and the program."""
+    """8 GB in a file of a few megabytes: 28 bytes for each observation and control of a step, and more."""
     eight = large(tmp_path / "eight.hdf5", 10, 100_000)
-    spec, size = (
-        spec_of(eight, "state"),
-        f"{math.ceil((28 * 10**6 * (1000 + 2) + arrays.PROGRAM) / 1e8) / 10:g}",
-    )
-    for command in (
-        ["check", spec],
-        ["fit", spec, "--out", tmp_path / "run"],
-        ["select", spec, "--out", tmp_path],
-    ):
+    spec, out = spec_of(eight, "state"), ("--out", tmp_path)
+    size = f"{math.ceil((28 * 10**6 * (1000 + 2) + arrays.PROGRAM) / 1e8) / 10:g}"
+    for command in (["check", spec], ["fit", spec, "--out", tmp_path / "run"], ["select", spec, *out]):
         refused(f": {eight}: a fit to state takes about {size} GB of memory, and 2 are free; leave", *command)
     assert not (tmp_path / "run").exists()
     done("check", spec_of(eight, "arm"))

@@ -61,9 +61,10 @@ def test_the_base_of_a_mobile_robot_is_part_of_its_control(tmp_path: Path) -> No
         np.testing.assert_array_equal(demo.actions, np.hstack([odd.control(number), -odd.control(number)]))
 
 
-@pytest.mark.parametrize(
-    "name", [name for name, row in odd.ROWS.items() if row.says not in (None, odd.IMPORT)]
-)
+NAMED = [name for name, row in odd.ROWS.items() if row.says not in (None, odd.IMPORT)]
+
+
+@pytest.mark.parametrize("name", NAMED)
 def test_what_is_not_read_is_named_with_a_remedy(name: str, tmp_path: Path) -> None:
     row = odd.ROWS[name]
     path = row.make(tmp_path)
@@ -87,31 +88,23 @@ def test_what_is_to_be_imported_first_is_named(tmp_path: Path) -> None:
 def test_files_of_a_folder_are_pooled_with_their_names_as_task(tmp_path: Path) -> None:
     folder = tmp_path / "tasks"
     folder.mkdir()
-    parts = {
-        task: demonstrations(count, {"valid": ("demo_1",)}) for task, count in (("close", 2), ("open_10", 3))
-    }
+    counts = {"close": 2, "open_10": 3}
+    parts = {task: demonstrations(count, {"valid": ("demo_1",)}) for task, count in counts.items()}
     for task, demos in parts.items():
         replace(demos, attributes={"control_frequency": 20}).write(folder / f"{task}.hdf5")
     assert inspect(folder).format == "folder"
     pooled = imported(folder, tmp_path)
-    assert pooled.names == (
-        "close_demo_0",
-        "close_demo_1",
-        "open_10_demo_0",
-        "open_10_demo_1",
-        "open_10_demo_2",
-    )
+    opened = ("open_10_demo_0", "open_10_demo_1", "open_10_demo_2")
+    assert pooled.names == ("close_demo_0", "close_demo_1", *opened)
     assert pooled.masks == {"valid": ("close_demo_1", "open_10_demo_1")}
     assert pooled.frequency == 20
-    for demo, (task, own) in zip(
-        pooled, ((task, demo) for task, part in parts.items() for demo in part), strict=True
-    ):
+    each = [(task, demo) for task, part in parts.items() for demo in part]
+    for demo, (task, own) in zip(pooled, each, strict=True):
         assert demo.attributes["task"] == task
         np.testing.assert_array_equal(demo.actions, own.actions)
         np.testing.assert_array_equal(demo.observations["pose"], own.observations["pose"])
     with h5py.File(folder / "open_10.hdf5", "r+") as file:
         del file["data/demo_0/obs/pose"]
-    with pytest.raises(
-        DemonstrationsError, match="open_10_demo_0: obs/pose is missing, which close_demo_0 has"
-    ):
+    says = "open_10_demo_0: obs/pose is missing, which close_demo_0 has"
+    with pytest.raises(DemonstrationsError, match=says):
         import_demonstrations(folder, tmp_path / "again.hdf5")

@@ -27,9 +27,8 @@ def seen(demo: Demonstration) -> dict[str, np.ndarray]:
 
 def scaled(factor: float, *keys: str) -> Change:
     def change(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np.ndarray]:
-        return {
-            key: array * (factor if key in keys else 1) for key, array in seen(demo).items()
-        }, demo.actions
+        factors = {key: factor if key in keys else 1 for key in seen(demo)}
+        return {key: array * factors[key] for key, array in seen(demo).items()}, demo.actions
 
     return change
 
@@ -56,22 +55,11 @@ def moved(demo: Demonstration, other: Demonstration) -> tuple[dict[str, Any], np
 
 POSITIONS = ("gripper", "object", "goal")
 
+GRIPPER = "obs/gripper dimensions 0-2"
 FAULTS: dict[str, tuple[Change, str, str]] = {
-    "millimetres": (
-        scaled(1000, *POSITIONS),
-        "obs/gripper dimensions 0-2",
-        "1000 times as large as {}, perhaps milli",
-    ),
-    "metres": (
-        scaled(0.01, "gripper"),
-        "obs/gripper dimensions 0-2",
-        "100 times as small as {}, perhaps metres for",
-    ),
-    "degrees": (
-        scaled(57.3, "gripper"),
-        "obs/gripper",
-        "57.3 times as large as {}, perhaps degrees for radians",
-    ),
+    "millimetres": (scaled(1000, *POSITIONS), GRIPPER, "1000 times as large as {}, perhaps milli"),
+    "metres": (scaled(0.01, "gripper"), GRIPPER, "100 times as small as {}, perhaps metres for"),
+    "degrees": (scaled(57.3, "gripper"), "obs/gripper", "57.3 times as large as {}, perhaps degrees for"),
     "gripper": (reversed_gripper, "control dimension 3", "the other sign than {}, perhaps reversed"),
     "joined": (joined, "observations jump at once, in demo_3 at step 4", "perhaps two recordings are joined"),
 }
@@ -158,18 +146,16 @@ def test_label_warns_of_demonstrations_unlike_those_of_the_fit(run: Path, tmp_pa
         (line,) = session.warnings()
     finally:
         session.close()
-    assert line.startswith(
-        "unlike the demonstrations of the fit: demo_3, demo_5 (2 of 6): control dimension 3"
-    )
+    says = "unlike the demonstrations of the fit: demo_3, demo_5 (2 of 6): control dimension 3"
+    assert line.startswith(says)
 
 
 def test_fit_warns_of_demonstrations_unlike_the_others(tmp_path: Path) -> None:
     path = tmp_path / "demos.hdf5"
     spoilt(pick_and_place(8), reversed_gripper, (3, 5)).write(path)
     training = {"optimizer": {"name": "em"}, "tune_fraction": 0, "epochs": 2}
-    spec = small_spec(
-        demonstrations={"path": str(path)}, observations=["gripper", "object", "jaw"], training=training
-    )
+    known = {"demonstrations": {"path": str(path)}, "observations": ["gripper", "object", "jaw"]}
+    spec = small_spec(**known, training=training)
     (tmp_path / "spec.yaml").write_text(dump_spec(spec))
     said = call("fit", tmp_path / "spec.yaml", "--out", tmp_path / "run", "--jobs", 1).out
     assert "warning: demo_3, demo_5 (2 of 8): control dimension 3 has the other sign than in most" in said
@@ -180,8 +166,7 @@ def test_segment_says_where_files_have_other_rates_and_nothing_else_of_the_same_
     rate: int, notes: int, run: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "demos.hdf5"
-    Demonstrations(pick_and_place(6, seed=1).demonstrations, attributes={"control_frequency": rate}).write(
-        path
-    )
+    demos = pick_and_place(6, seed=1).demonstrations
+    Demonstrations(demos, attributes={"control_frequency": rate}).write(path)
     said = call("segment", run, path, "--csv", tmp_path / "segments.csv").err
     assert said.count("note: ") == said.count("(6 of 6): 10 Hz, and 30 Hz in the fit\n") == notes

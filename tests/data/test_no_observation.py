@@ -46,8 +46,10 @@ LEFT_OUT: dict[str, tuple[str, Observed, str]] = {
     "frames": ("frame", lambda u, n: np.arange(len(u))[:, None], "is a clock"),
     "progress, as parts of each": ("progress", lambda u, n: np.linspace(0, 1, len(u)), "is a clock"),
     "uneven stamps by name": ("camera/timestamp", lambda u, n: UNEVEN[: len(u)], "is a clock"),
-    "millimetres": ("mm", lambda u, n: 1000 * u[:, :3] + 7, f"is control dimensions 0-2 at the same step, {CONTROL}"),
-    "noise of 1e-4": ("command", lambda u, n: noisy(u), f"is control dimensions 0-3 at the same step, {CONTROL}"),
+    "millimetres": ("mm", lambda u, n: 1000 * u[:, :3] + 7,
+        f"is control dimensions 0-2 at the same step, {CONTROL}"),
+    "noise of 1e-4": ("command", lambda u, n: noisy(u),
+        f"is control dimensions 0-3 at the same step, {CONTROL}"),
     "the next one, reversed": (
         "ahead",
         lambda u, n: -np.concatenate([u[1:, :2], u[:1, :2]])[:, ::-1],
@@ -58,8 +60,10 @@ LEFT_OUT: dict[str, tuple[str, Observed, str]] = {
         lambda u, n: (np.arange(len(u)) > 9).astype(float),
         "is a label, labels/subtask, and no observation",
     ),
-    "a generator's pose": ("datagen_info/eef", lambda u, n: RANDOM.normal(size=(len(u), 16)), "is what a generator"),
-    "a controller's target": ("target_eef_pose", lambda u, n: RANDOM.normal(size=(len(u), 3)), "is the target of a"),
+    "a generator's pose": ("datagen_info/eef", lambda u, n: RANDOM.normal(size=(len(u), 16)),
+        "is what a generator"),
+    "a controller's target": ("target_eef_pose", lambda u, n: RANDOM.normal(size=(len(u), 3)),
+        "is the target of a"),
 }  # fmt: skip
 
 
@@ -102,7 +106,7 @@ def test_a_state_that_follows_slow_targets_closely_is_read(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("place", ["datagen_info", "obs/datagen_info"], ids=["MimicGen", "Isaac Lab"])
 def test_signals_of_subtasks_are_labels(place: str, tmp_path: Path) -> None:
-    """A signal is 1 from the last step of its subtask on. What follows the last one is a subtask without a signal."""
+    """A signal is 1 from the last step of its subtask on. What follows the last one has no signal."""
     path = tmp_path / "demos.hdf5"
     pick_and_place(6).write(path)
     with h5py.File(path, "r+") as file:
@@ -111,9 +115,8 @@ def test_signals_of_subtasks_are_labels(place: str, tmp_path: Path) -> None:
             del group["labels"]
             group[f"{place}/subtask_term_signals/reach"] = (steps >= 4 + number).astype(int)
             group[f"{place}/subtask_term_signals/grasp"] = (steps >= 9).astype(int)
-    expected = [
-        np.repeat([0, 1, 2], [5 + n, 5 - n, len(demo) - 10]) for n, demo in enumerate(pick_and_place(6))
-    ][:5]
+    lengths = [[5 + n, 5 - n, len(demo) - 10] for n, demo in enumerate(pick_and_place(6))]
+    expected = [np.repeat([0, 1, 2], each) for each in lengths][:5]
     for read in (Demonstrations.read(path), Demonstrations.read(path, ["gripper"], ["subtask"])):
         for demo, labels in zip(read, expected, strict=False):
             assert demo.labels["subtask"].tolist() == labels.tolist()

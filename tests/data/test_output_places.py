@@ -39,7 +39,7 @@ def inputs(toy_run, tmp_path_factory) -> Path:
 
 
 class Command(NamedTuple):
-    """Arguments before the place that is written, an input that it must not be, and whether it is a folder."""
+    """Arguments before the place that is written, an input that it must not be, whether it is a folder."""
 
     arguments: str
     read: str
@@ -47,6 +47,7 @@ class Command(NamedTuple):
 
 
 WITHIN = "lies in {}, which this command reads"
+ENCODED = "encode demos.hdf5 --observation camera --encoder timm:resnet18.a1_in1k --out"
 COMMANDS = {
     "segment --csv": Command("segment run demos.hdf5 --csv", "demos.hdf5"),
     "segment of links --csv": Command("segment run linked --csv", "linked"),
@@ -57,9 +58,7 @@ COMMANDS = {
     "fit": Command("fit toy.yaml --out", "toy.yaml", folder=True),
     "collect": Command("collect toy.yaml --out", "toy.yaml"),
     "init": Command("init demos.hdf5 --force --out", "demos.hdf5"),
-    "encode": Command(
-        "encode demos.hdf5 --observation camera --encoder timm:resnet18.a1_in1k --out", "demos.hdf5"
-    ),
+    "encode": Command(ENCODED, "demos.hdf5"),
     "import": Command("import demos.hdf5 --out", "demos.hdf5"),
 }
 
@@ -142,9 +141,8 @@ def test_no_file_but_a_labelled_copy_is_replaced(toy_run, file: Path, tmp_path: 
     done("segment", toy_run.folder, other, "--out", copy)
     for there in (other, copy):
         before = there.read_bytes()
-        says = (
-            f"--out {there}: exists and is not a labelled copy of {file}; choose another --out, or remove it"
-        )
+        remedy = "choose another --out, or remove it"
+        says = f"--out {there}: exists and is not a labelled copy of {file}; {remedy}"
         refused(says, "segment", toy_run.folder, file, "--out", there)
         assert there.read_bytes() == before
 
@@ -201,7 +199,7 @@ def test_a_name_that_is_a_formula_is_quoted_in_csv(toy_run, file: Path, tmp_path
 
 
 def test_a_rollout_asks_for_what_its_report_needs_first(toy_run, tmp_path: Path, monkeypatch) -> None:
-    """Demonstrations that were moved are named before any episode is played; so is a report that cannot be written."""
+    """Demonstrations that were moved are named before any episode is played; so is a report's bad place."""
     run, gone = shutil.copytree(toy_run.folder, tmp_path / "run"), tmp_path / "gone.hdf5"
     played: list[object] = []
     monkeypatch.setattr("ddco_pyro.fitting.rollouts.run_episodes", lambda *how: played.append(how))
@@ -226,7 +224,6 @@ def test_commands_are_printed_as_a_shell_takes_them(tmp_path: Path, monkeypatch)
     assert shlex.split(said) == ["ddco-pyro", "init", "a b.hdf5", "--out", "a b.yaml"]
     said = call(*shlex.split(said)[1:]).out.partition("fit it with: ")[2]
     assert shlex.split(said) == ["ddco-pyro", "fit", "a b.yaml", "--out", "runs/a b"]
-    assert (
-        "# Fit it:              ddco-pyro fit 'a b.yaml' --out runs/first\n" in Path("a b.yaml").read_text()
-    )
+    said = Path("a b.yaml").read_text()
+    assert "# Fit it:              ddco-pyro fit 'a b.yaml' --out runs/first\n" in said
     done("check", "a b.yaml")

@@ -42,13 +42,8 @@ def test_skip_broken_leaves_out_what_is_not_there(row: str, tmp_path: Path) -> N
     odd: Row = ROWS[row]
     ended = done("import", odd.make(tmp_path), "--out", tmp_path / "out.hdf5", "--skip-broken")
     assert "left out demo_1: demo_1" in ended.err
-    assert Demonstrations.read(tmp_path / "out.hdf5").names == (
-        "demo_0",
-        "demo_2",
-        "demo_3",
-        "demo_4",
-        "demo_5",
-    )
+    kept = ("demo_0", "demo_2", "demo_3", "demo_4", "demo_5")
+    assert Demonstrations.read(tmp_path / "out.hdf5").names == kept
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Pictures stay in their file: what is read of them, what networks see, and that a fit is the same bit for bit."""
+"""Pictures stay in their file: what is read of them, what networks see, and a fit is the same to a bit."""
 
 import pickle
 from pathlib import Path
@@ -42,9 +42,8 @@ def demonstrations(number: int = 8) -> Demonstrations:
             "pose": random.normal(size=(steps, 3)),
             "camera": random.integers(0, 256, (steps, HEIGHT, WIDTH, 3), dtype=np.uint8),
         }
-        return Demonstration(
-            f"demo_{index}", seen, random.normal(size=(steps, 2)), {"phase": np.arange(steps) // 4}
-        )
+        labels = {"phase": np.arange(steps) // 4}
+        return Demonstration(f"demo_{index}", seen, random.normal(size=(steps, 2)), labels)
 
     return Demonstrations(tuple(one(index) for index in range(number)))
 
@@ -116,9 +115,8 @@ def test_transform_by_hand() -> None:
 def test_pictures_are_cut_and_scaled_wherever_they_are(kept: Path) -> None:
     encoder = ObservationEncoder([ObservationSpec(**RAW)], {"camera": (HEIGHT, WIDTH, 3)})
     assert encoder.images == {"camera": (5, 4, 3)}
-    read, made = (
-        [demo.observations for demo in demos] for demos in (Demonstrations.read(kept), demonstrations())
-    )
+    both = (Demonstrations.read(kept), demonstrations())
+    read, made = ([demo.observations for demo in demos] for demos in both)
     seen, expected = (encoder.inputs(each).loaded().images["camera"] for each in (read, made))
     assert torch.equal(seen, expected)
     first = made[0]["camera"][0, 1:11, 2:10]
@@ -143,11 +141,8 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     spec = parse_spec(spec_of(Path("unused"), {"key": "camera", "shift": 3}))
     encoder = ObservationEncoder(spec.observations, demonstrations().observation_shapes)
     demos = demonstrations()
-    whole = Batch(
-        encoder.inputs(demo.observations for demo in demos),
-        torch.zeros(8, 40, 2),
-        torch.tensor(demos.lengths),
-    )
+    inputs = encoder.inputs(demo.observations for demo in demos)
+    whole = Batch(inputs, torch.zeros(8, 40, 2), torch.tensor(demos.lengths))
     for seed in (1, 2):
         seen = whole.varied(encoder.shifts, seed)
         shifts = seen.inputs.images["camera"].shifts
@@ -162,13 +157,13 @@ def test_a_trajectory_is_shifted_as_one_and_anew_in_each_epoch() -> None:
     assert (other != shifts).any()
 
 
+NOT_WITHIN = r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels"
+
+
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        (
-            {"key": "camera", "crop": [3, 3, 10, 4]},
-            r"'camera' crop: \[3, 3, 10, 4\] is not within 12 × 10 pixels",
-        ),
+        ({"key": "camera", "crop": [3, 3, 10, 4]}, NOT_WITHIN),
         ({"key": "pose", "resize": [4, 4]}, r"'pose' has shape \[3\] at each step: crop and resize are for"),
         ({"key": "pose", "shift": 1}, r"'pose' has shape \[3\] at each step: shift is f"),
         ({"key": "camera", "bins": 4}, r"'camera' has pictures: bins are for vectors"),
@@ -234,15 +229,9 @@ def test_a_damaged_picture_is_one_line(kept: Path, tmp_path: Path) -> None:
 # --- a policy is learnt from pictures -----------------------------------------------------------------------
 
 
-CONVOLUTION = {
-    "network": "conv",
-    "layers": [
-        {"filters": 4, "kernel": 5, "stride": 2, "padding": 2},
-        {"filters": 4, "kernel": 3, "padding": 1},
-    ],
-    "pool": "spatial_softmax",
-    "hidden": [16],
-}
+FIRST = {"filters": 4, "kernel": 5, "stride": 2, "padding": 2}
+LAYERS = [FIRST, {"filters": 4, "kernel": 3, "padding": 1}]
+CONVOLUTION = {"network": "conv", "layers": LAYERS, "pool": "spatial_softmax", "hidden": [16]}
 
 
 def test_a_dot_is_followed():

@@ -1,4 +1,4 @@
-"""Places where nothing can be written: a full disk, a folder that is read-only, a folder that another process is at."""
+"""Places where nothing can be written: a full disk, a read-only folder, one that another process is at."""
 
 import os
 import resource
@@ -30,14 +30,14 @@ def fails_on_a_full_disk(size: int, *command: object) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert ended.status == 1, ended.err
-    assert (
-        "there is no room to write it; free some space, then do the same again" in ended.err.splitlines()[-1]
-    )
+    says = "there is no room to write it; free some space, then do the same again"
+    assert says in ended.err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    "size", [5000, *(pytest.param(size, marks=pytest.mark.slow) for size in (0, 60_000))]
-)
+SLOW = [pytest.param(size, marks=pytest.mark.slow) for size in (0, 60_000)]
+
+
+@pytest.mark.parametrize("size", [5000, *SLOW])
 def test_a_full_disk_while_importing(tmp_path: Path, size: int) -> None:
     source, out = tmp_path / "source.hdf5", tmp_path / "out.hdf5"
     demonstrations(20).write(source)
@@ -66,9 +66,8 @@ def test_a_full_disk_while_fitting(tmp_path: Path, cache) -> None:
     fails_on_a_full_disk(4000, "fit", spec, "--out", tmp_path / "run", *short)
     done("fit", spec, "--out", tmp_path / "run", *short)
     done("fit", spec, "--out", tmp_path / "other", *short)
-    assert (tmp_path / "run/model.safetensors").read_bytes() == (
-        tmp_path / "other/model.safetensors"
-    ).read_bytes()
+    run, other = ((tmp_path / name / "model.safetensors").read_bytes() for name in ("run", "other"))
+    assert run == other
 
 
 def test_a_read_only_folder(tmp_path: Path) -> None:
@@ -87,10 +86,8 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
         if os.getuid() == 0:
             os.setuid(65534)  # nobody
         said = []
-        for attempt in (
-            lambda: write_text(folder / "file", "x"),
-            lambda: only_one(folder / "run").__enter__(),
-        ):
+        claims = (lambda: write_text(folder / "file", "x"), lambda: only_one(folder / "run").__enter__())
+        for attempt in claims:
             with pytest.raises(BadInput) as refused:
                 attempt()
             said.append(str(refused.value))

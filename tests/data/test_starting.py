@@ -42,32 +42,27 @@ NOISE = 0.1
 
 
 def two_skills(path: Path, number: int = 12) -> None:
-    """One skill follows ``place``, the other flees from it; ``side`` tells them apart, ``goal`` is constant."""
+    """One skill follows ``place``, the other flees it; ``side`` tells them apart, ``goal`` is constant."""
     random = np.random.default_rng(0)
     records = []
     for _ in range(number):
         skill = np.repeat([5, 2, 5], [4, 5, 4])
         side = np.where(skill == 5, 1.0, -1.0)[:, None]
         place = random.normal(size=(13, 1))
-        seen = {
-            "side": side + 0.1 * random.normal(size=(13, 1)),
-            "place": place,
-            "goal": np.full((13, 2), 3.0),
-        }
+        seen = {"side": side + 0.1 * random.normal(size=(13, 1)), "place": place}
+        seen["goal"] = np.full((13, 2), 3.0)
         actions = side * place + NOISE * random.normal(size=(13, 1))
         records.append((seen, actions, {"skill": skill}))
     numbered(records).write(path)
 
 
 def short_of_the_truth(fit: ddco_pyro.Fit) -> float:
-    """Held-out nats per step that a fit to :func:`two_skills` lacks, beside the policy that they were drawn from."""
+    """Held-out nats per step that a fit to :func:`two_skills` lacks, beside the policy that drew them."""
     held_out = fit.demonstrations.select([one.name for one in fit.metrics.valid])
-    side = [
-        np.where(demo.labels["skill"] == 5, 1, -1)[:, None] * demo.observations["place"] for demo in held_out
-    ]
-    truth = stats.norm.logpdf(
-        np.concatenate([demo.actions for demo in held_out]), np.concatenate(side), NOISE
-    ).mean()
+    ways = [np.where(demo.labels["skill"] == 5, 1, -1)[:, None] for demo in held_out]
+    side = [way * demo.observations["place"] for way, demo in zip(ways, held_out, strict=True)]
+    actions = np.concatenate([demo.actions for demo in held_out])
+    truth = stats.norm.logpdf(actions, np.concatenate(side), NOISE).mean()
     return float(truth - fit.metrics.log_likelihood_per_step.valid)
 
 
@@ -83,10 +78,8 @@ def test_what_it_writes_finds_what_was_planted_as_it_is(path: Path, tmp_path: Pa
     assert re.fullmatch(r"median segment [\d.]+ steps in small fits", said[1])
     assert said[2:] == [f"{spec}: fit it with: ddco-pyro fit {spec} --out runs/spec"]
     ended = done("fit", spec, "--out", tmp_path / "run")
-    assert (
-        ended.out.splitlines()[-1]
-        == f"next: ddco-pyro segment {tmp_path / 'run'} '{path}' --html segments.html"
-    )
+    line = f"next: ddco-pyro segment {tmp_path / 'run'} '{path}' --html segments.html"
+    assert ended.out.splitlines()[-1] == line
     looked = call("inspect", path).out.splitlines()[-1]
     assert looked == f"next: ddco-pyro init '{path}' --out 'my demos: 1.yaml'"
     fit = ddco_pyro.load(tmp_path / "run")
@@ -148,9 +141,8 @@ def test_options_are_compared_with_the_labels_that_know_most(path: Path) -> None
     assert "      count: 2                      # as many as the values of labels/whole; try others:" in text
     few = sum(list(facts.lengths.values())[:2])
     known = {"other": steps, "phase": few, "all": steps, "option": steps, "option_boundary": steps}
-    assert re.findall(r"# labels: (\w+)   # known in (\d+) of", text) == [
-        (key, str(known[key])) for key in known
-    ]
+    found = re.findall(r"# labels: (\w+)   # known in (\d+) of", text)
+    assert found == [(key, str(known[key])) for key in known]
 
 
 def test_a_few_broken_demonstrations_are_left_out(path: Path, tmp_path: Path) -> None:
@@ -176,9 +168,8 @@ def test_of_many_broken_demonstrations_the_key_is_left_out(path: Path) -> None:
     assert "# - pose   # has 2 NaN and 0 infinite values" in text
     assert "- {key: camera}" in text
     assert "exclude" not in broken(path, 10, ["demo_2"], valid=("demo_2",))  # nothing would be held out
-    with pytest.raises(
-        DemonstrationsError, match="actions has 1 NaN and 0 infinite values; repair them first"
-    ):
+    says = "actions has 1 NaN and 0 infinite values; repair them first"
+    with pytest.raises(DemonstrationsError, match=says):
         broken(path, 4, ["demo_1"], "actions")  # a quarter
 
 
@@ -186,9 +177,8 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     """Two cameras, a small one as it is and a larger one reduced; what is written can be fitted."""
     random, records = np.random.default_rng(2), []
     for _ in range(6):
-        seen = {
-            name: random.integers(0, 256, (5, *size, 3), dtype=np.uint8) for name, size in CAMERAS.items()
-        }
+        sizes = {name: (5, *size, 3) for name, size in CAMERAS.items()}
+        seen = {name: random.integers(0, 256, size, dtype=np.uint8) for name, size in sizes.items()}
         records.append((seen, random.normal(size=(5, 2))))
     numbered(records).write(tmp_path / "seen.hdf5")
     written = started(tmp_path / "seen.hdf5")
@@ -200,7 +190,8 @@ def test_pictures_alone_are_seen_by_one_network(tmp_path: Path) -> None:
     assert set(spec.hierarchy.trunk.of) == set(CAMERAS)
     fit = ddco_pyro.fit(load_spec(written, ["training.epochs=2"]))
     assert list(fit.baselines) == ["mixture", "flat_equal"]
-    said = "Options and mixture have one σ for each option; flat of equal size has a σ that depends on the state."
+    said = "Options and mixture have one σ for each option; flat of equal size has a σ that depends on the "
+    said += "state."
     assert stds(fit) == said
 
 
@@ -214,7 +205,7 @@ def write(folder: Path, text: str) -> Path:
 
 
 def turning(path: Path) -> None:
-    """An arm that turns on and on: its angle jumps by 2π or 360, its quaternion changes sign; others only look so."""
+    """An arm that turns on: its angle jumps by 2π or 360, its quaternion changes sign; others seem to."""
     random, records = np.random.default_rng(3), []
     for number in range(8):
         angle = np.linspace(0, 7, 50) + random.uniform(-3, 3) + 0.02 * random.normal(size=50)
@@ -245,12 +236,10 @@ def test_what_jumps_as_an_angle_or_a_quaternion_is_read_without_its_jumps(path: 
         "obs/pose: dimensions 3-6 change sign",
         "obs/yaw: dimension 1 jumps by 2π",
     ]
-    spec = load_spec(
-        write(tmp_path, starting_spec(inspect(path), path).text), ["training.epochs=2", "compare_with=[]"]
-    )
-    read = {
-        one.key: (one.angles, one.quaternions) for one in spec.observations if one.angles or one.quaternions
-    }
+    text = starting_spec(inspect(path), path).text
+    spec = load_spec(write(tmp_path, text), ["training.epochs=2", "compare_with=[]"])
+    turned = [one for one in spec.observations if one.angles or one.quaternions]
+    read = {one.key: (one.angles, one.quaternions) for one in turned}
     assert read == {"pose": ((), (3,)), "yaw": ((1,), ())}
     encoder = ddco_pyro.fit(spec).hierarchy.encoder
     for demo in Demonstrations.read(path):
@@ -280,9 +269,8 @@ def test_text_alone_cannot_be_fitted(path: Path) -> None:
         for group in file["data"].values():
             del group["obs/pose"], group["obs/camera"]
             group["obs/text"] = [b"a"] * len(group["actions"])
-    with pytest.raises(
-        DemonstrationsError, match=r"no observation can be used: obs/text holds text, not numbers; see"
-    ):
+    says = r"no observation can be used: obs/text holds text, not numbers; see"
+    with pytest.raises(DemonstrationsError, match=says):
         starting_spec(inspect(path), path)
 
 
@@ -309,21 +297,17 @@ def test_few_demonstrations_all_train(path: Path, tmp_path: Path) -> None:
     assert [one.training.tune_fraction for one in (few, more)] == [0, 0.1]
 
 
-@pytest.mark.parametrize(
-    ("labels", "count"),
-    [({"one": 1}, 4), ({"many": 31}, 4), ({"coarse": 2, "fine": 6, "one": 1}, 6)],
-)
+LABELS = [({"one": 1}, 4), ({"many": 31}, 4), ({"coarse": 2, "fine": 6, "one": 1}, 6)]
+
+
+@pytest.mark.parametrize(("labels", "count"), LABELS)
 @pytest.mark.usefixtures("undecided")
-def test_there_are_as_many_options_as_labels(
-    labels: dict[str, int], count: int, path: Path, tmp_path: Path
-) -> None:
+def test_there_are_as_many_options_as_labels(labels, count: int, path: Path, tmp_path: Path) -> None:
     """Of the labelling that knows most; ``coarse`` knows no label in the first step."""
     records = []
     for number in range(9):
-        seen, actions = (
-            {"pose": np.random.default_rng(number).normal(size=(40, 2))},
-            np.arange(40.0)[:, None] % 5,
-        )
+        seen = {"pose": np.random.default_rng(number).normal(size=(40, 2))}
+        actions = np.arange(40.0)[:, None] % 5
         given = {name: (np.arange(40) * most // 40) - 10 * (name == "fine") for name, most in labels.items()}
         if "coarse" in given:
             given["coarse"][0] = -1
@@ -331,9 +315,8 @@ def test_there_are_as_many_options_as_labels(
     numbered(records).write(path)
     ended = call("init", path, "--out", tmp_path / "spec.yaml")
     assert load_spec(tmp_path / "spec.yaml").hierarchy.levels[0].count == count
-    said = [
-        f"{count} options, as many as the values of labels/{name}" for name in labels if labels[name] == count
-    ]
+    chosen = [name for name in labels if labels[name] == count]
+    said = [f"{count} options, as many as the values of labels/{name}" for name in chosen]
     assert ended.out.splitlines()[:-1] == said
 
 
@@ -354,17 +337,8 @@ def of_operators(path: Path, operators: str) -> Path:
 @pytest.mark.usefixtures("undecided")
 def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: Path, tmp_path: Path) -> None:
     """About a fifth is held out, the same in every call, and a fit has this division."""
-    ended = [
-        call(
-            "init",
-            of_operators(path, operators),
-            "--out",
-            tmp_path / f"{n}.yaml",
-            "--hold-out-by",
-            "operator",
-        )
-        for n in "01"
-    ]
+    asked, by = ("init", of_operators(path, operators)), ("--hold-out-by", "operator")
+    ended = [call(*asked, "--out", tmp_path / f"{n}.yaml", *by) for n in "01"]
     first, again = ((tmp_path / f"{n}.yaml").read_text() for n in "01")
     assert first.replace("0.yaml", "1.yaml") == again
     said = re.fullmatch(
@@ -372,9 +346,8 @@ def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: 
     )
     spec = load_spec(tmp_path / "0.yaml")
     for demos in (read_demonstrations(spec), outline(spec), seen(spec, Demonstrations.read(path))):
-        train, valid = (
-            [one.attributes["operator"] for one in part] for part in train_and_valid(spec, demos).values()
-        )
+        parts = train_and_valid(spec, demos).values()
+        train, valid = ([one.attributes["operator"] for one in part] for part in parts)
         assert {*train} | {*valid} == {*operators}
         assert not {*train} & {*valid}
         assert (", ".join(sorted({*valid})), str(len(valid))) == said.groups()
@@ -383,16 +356,11 @@ def test_no_operator_is_on_both_sides(operators: str, held_out: set[int], path: 
     assert (len(drawn) > 1) == (len({*operators}) > 2)
 
 
-@pytest.mark.parametrize(
-    ("attribute", "says"),
-    [
-        (
-            "operater",
-            "demo_0 has no attribute 'operater' (did you mean 'operator'?); there is: operator, robot",
-        ),
-        ("robot", "attribute 'robot' is left in all demonstrations; hold out by another one"),
-    ],
-)
+MISSPELT = "demo_0 has no attribute 'operater' (did you mean 'operator'?); there is: operator, robot"
+ALIKE = "attribute 'robot' is left in all demonstrations; hold out by another one"
+
+
+@pytest.mark.parametrize(("attribute", "says"), [("operater", MISSPELT), ("robot", ALIKE)])
 @pytest.mark.usefixtures("undecided")
 def test_what_cannot_be_held_out_by(attribute: str, says: str, path: Path, tmp_path: Path) -> None:
     spec = tmp_path / "spec.yaml"
@@ -411,7 +379,7 @@ FITTED = ("grey alone", "demonstrations of one step")
 
 
 def started(path: Path) -> Path | None:
-    """The spec that ``init`` writes; None where it refuses the file in one line, and ``inspect`` names the problem."""
+    """The spec that ``init`` writes; None where it refuses the file in a line, and ``inspect`` says why."""
     spec = path.with_suffix(".yaml")
     ended = call("init", path, "--out", spec)
     assert ended.status in (0, 2), ended.err
@@ -433,9 +401,8 @@ def test_what_init_accepts_check_accepts(name: str, tmp_path: Path) -> None:
         with pytest.raises(DemonstrationsError, match=says):
             starting_spec(found, path)
         said = "\n".join([*found.problems, *found.notes])
-        assert (
-            re.search(says, said) or found.problems or found.leaks or all(d.constant for d in found.control)
-        )
+        nothing = all(dimension.constant for dimension in found.control)
+        assert re.search(says, said) or found.problems or found.leaks or nothing
     elif name in FITTED:
         run = spec.with_suffix(".run")
         done("fit", spec, "--out", run, "--jobs", 1, *with_set("training.epochs=2", "compare_with=[]"))

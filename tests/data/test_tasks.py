@@ -49,9 +49,8 @@ def four_tasks(number: int = 10, seed: int = 0) -> Demonstrations:
             states = random.normal(0, STATE, (len(phases), 2))
             controls = places[task + len(TASKS) * phases] - states + random.normal(0, NOISE, states.shape)
             about = {"task": name}
-            demos.append(
-                Demonstration(f"demo_{len(demos)}", {"state": states}, controls, {"phase": phases}, about)
-            )
+            own = ({"state": states}, controls, {"phase": phases}, about)
+            demos.append(Demonstration(f"demo_{len(demos)}", *own))
     return Demonstrations(tuple(demos))
 
 
@@ -98,9 +97,9 @@ def test_inspect_lists_tasks_with_what_only_some_have(path: Path, tmp_path: Path
             if group.attrs["task"] != "push":
                 group["obs/lid"] = np.zeros((len(group["actions"]), 1))
     rows = [line.split("│") for line in call("inspect", tmp_path / "four.hdf5").out.splitlines()]
-    lengths = {
-        task: [len(demo) for demo in four_tasks(3) if demo.attributes["task"] == task] for task in TASKS
-    }
+    lengths = {task: [] for task in TASKS}
+    for demo in four_tasks(3):
+        lengths[demo.attributes["task"]].append(len(demo))
     for task, steps in lengths.items():
         (row,) = [[cell.strip() for cell in row] for row in rows if row[0].strip() == task]
         span = f"{min(steps)} to {max(steps)}"
@@ -129,13 +128,13 @@ def test_where_asks_for_tasks(path: Path, run: ddco_pyro.Fit, tmp_path: Path) ->
     assert {*ddco_pyro.load(tmp_path / "run").demonstrations.tasks} == {"push"}
 
 
+NO_TASK = "no demonstration has task=opem (did you mean 'open'?); there is: close, open, press, push"
+
+
 @pytest.mark.parametrize(
     ("where", "says"),
     [
-        (
-            "task=opem",
-            "no demonstration has task=opem (did you mean 'open'?); there is: close, open, press, push",
-        ),
+        ("task=opem", NO_TASK),
         ("operator=A", "demo_0 has no attribute 'operator'; there is: task"),
         ("task", "--where task: write ATTRIBUTE=VALUE, such as task=reach"),
     ],
@@ -181,9 +180,8 @@ def test_files_are_pooled_with_the_keys_that_all_have(tmp_path: Path) -> None:
     for name, size in (("open", 4), ("push", 7)):
         seen = {key: np.ones((5, width)) for key, width in {"pose": 2, f"of_{name}": 1, "size": size}.items()}
         labels = {"phase": [0, 0, 1, 1, 2], name: [1] * 5}
-        numbered((seen, random.normal(size=(5, 2)), labels) for _ in range(2)).write(
-            tmp_path / f"{name}.hdf5"
-        )
+        demos = numbered((seen, random.normal(size=(5, 2)), labels) for _ in range(2))
+        demos.write(tmp_path / f"{name}.hdf5")
     with h5py.File(tmp_path / "push.hdf5", "r+") as file:
         file.attrs["label_names"] = json.dumps({"phase": ["near", "touch", "shove"]})
     ended = done("import", tmp_path / "open.hdf5", tmp_path / "push.hdf5", "--out", tmp_path / "pooled.hdf5")
@@ -197,13 +195,11 @@ def test_files_are_pooled_with_the_keys_that_all_have(tmp_path: Path) -> None:
     assert pooled.tasks == ("open", "open", "push", "push")
     assert [*pooled.observation_shapes] == ["pose"]
     names = label_names(pooled.attributes)
-    said = {
-        (key, demo.attributes["task"]): [
-            names[key][value] if value >= 0 else None for value in demo.labels[key]
-        ]
-        for demo in pooled
-        for key in ("phase", "open")
-    }
+    said = {}
+    for demo in pooled:
+        for key in ("phase", "open"):
+            own = [names[key][value] if value >= 0 else None for value in demo.labels[key]]
+            said[key, demo.attributes["task"]] = own
     assert said["phase", "open"] == ["open: 0", "open: 0", "open: 1", "open: 1", "open: 2"]
     assert said["phase", "push"] == ["near", "near", "touch", "touch", "shove"]
     assert (said["open", "open"], said["open", "push"]) == (["open: 1"] * 5, [None] * 5)
@@ -221,11 +217,8 @@ def test_init_shows_the_task_to_gates_alone(spec: Spec) -> None:
     (level,) = spec.hierarchy.levels
     assert level.count == OPTIONS * len(TASKS)
     assert [one.key for one in spec.observations] == ["state", "task"]
-    assert (level.policy.inputs, level.termination.inputs, spec.hierarchy.meta_policy.inputs) == (
-        ("state",),
-        (),
-        (),
-    )
+    networks = (level.policy, level.termination, spec.hierarchy.meta_policy)
+    assert [network.inputs for network in networks] == [("state",), (), ()]
 
 
 def test_planted_options_agree_within_each_task(run: ddco_pyro.Fit, path: Path, tmp_path: Path) -> None:
@@ -263,9 +256,8 @@ def test_a_controller_takes_the_name_of_the_task(run: ddco_pyro.Fit) -> None:
         controller.reset(0)
         first[task] = controller.act({"state": state, "task": task})
         controller.reset(0)
-        numbers = (
-            np.eye(len(TASKS))[TASKS.index(task)] if task in TASKS else np.full(len(TASKS), 1 / len(TASKS))
-        )
+        known, count = np.eye(len(TASKS)), len(TASKS)
+        numbers = known[TASKS.index(task)] if task in TASKS else np.full(count, 1 / count)
         np.testing.assert_array_equal(controller.act({"state": state, "task": numbers}), first[task])
     assert len({tuple(first[task]) for task in TASKS}) > 1
 
@@ -274,9 +266,8 @@ def test_an_observation_relative_to_another_is_their_difference(tmp_path: Path) 
     random, records = np.random.default_rng(0), []
     for _ in range(6):
         cup, hand = random.normal(size=(2, 20, 3))
-        records.append(
-            ({"cup_pos": cup, "hand_pos": hand}, 0.5 * (cup - hand) + 0.1 * random.normal(size=(20, 3)))
-        )
+        controls = 0.5 * (cup - hand) + 0.1 * random.normal(size=(20, 3))
+        records.append(({"cup_pos": cup, "hand_pos": hand}, controls))
     demos = numbered(records)
     demos.write(tmp_path / "demos.hdf5")
     text = call("inspect", tmp_path / "demos.hdf5").out

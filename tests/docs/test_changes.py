@@ -1,4 +1,4 @@
-"""The changes that docs/architecture.md promises, made in a copy of the library: a new file each, and its row."""
+"""The changes that docs/architecture.md promises, made in a copy of the library: a file each and its row."""
 
 import os
 import shutil
@@ -67,49 +67,34 @@ COUNTS = '''
 from ddco_pyro.data.files import whole_file
 
 def write(asked, segmented):
+    counts = [f"{demo.name} {len(asked.runs(demo))}\\n" for demo in segmented.segments]
     with whole_file(asked.out) as temporary:
-        temporary.write_text("".join(f"{demo.name} {len(asked.runs(demo))}\\n" for demo in segmented.segments))
+        temporary.write_text("".join(counts))
     return str(asked.out)
 '''
 
+OF_NPZ = 'FORMATS = {"npz": Format("npz:open_npz", ".npz", fits=lambda path, names: path.suffix == ".npz"),'
+OF_COUNTS = 'FORMATS = {"--counts": Format("stream", "counts:write", "Counts."),'
+OPTION = '    counts: Annotated[Path | None, _to("--counts")] = None,\n    html: Annotated'
+COUNTED = {
+    "segmenting/formats/__init__.py": ("FORMATS = {", OF_COUNTS),
+    "cli/runs.py": ("    html: Annotated", OPTION),
+}
 CHANGES = {
     "model/emissions/laplace.py": (LAPLACE, {"spec/settings.py": ('"student",', '"student", "laplace",')}),
     "../squared.py": (NETWORK, {}),  # a spec names a class wherever it lies
-    "data/sources/npz.py": (
-        NPZ,
-        {
-            "data/formats.py": (
-                "FORMATS = {",
-                'FORMATS = {"npz": Format("npz:open_npz", ".npz", fits=lambda path, names: path.suffix == ".npz"),',
-            )
-        },
-    ),
-    "segmenting/formats/counts.py": (
-        COUNTS,
-        {
-            "segmenting/formats/__init__.py": (
-                "FORMATS = {",
-                'FORMATS = {"--counts": Format("stream", "counts:write", "Counts."),',
-            ),
-            "cli/runs.py": (
-                "    html: Annotated",
-                '    counts: Annotated[Path | None, _to("--counts")] = None,\n    html: Annotated',
-            ),
-        },
-    ),
+    "data/sources/npz.py": (NPZ, {"data/formats.py": ("FORMATS = {", OF_NPZ)}),
+    "segmenting/formats/counts.py": (COUNTS, COUNTED),
 }
 """A new file, and its rows: in a file what stands there, and the same with the row."""
 
+LINEAR = {"network": "linear"}
+LEVEL = {"count": 2, "policy": {"network": "squared:Squared"}, "termination": LINEAR}
 SPEC = {
     "demonstrations": {"path": "mine.hdf5"},
     "observations": ["place"],
     "control": {"kind": "laplace", "std": 0.5},
-    "hierarchy": {
-        "levels": [
-            {"count": 2, "policy": {"network": "squared:Squared"}, "termination": {"network": "linear"}}
-        ],
-        "meta_policy": {"network": "linear"},
-    },
+    "hierarchy": {"levels": [LEVEL], "meta_policy": LINEAR},
     "training": {"epochs": 2, "optimizer": {"name": "adam"}},
 }
 
@@ -155,9 +140,8 @@ def test_a_distribution_a_network_and_formats_are_a_file_and_a_row_each(changed)
     np.savez(changed / "mine.npz", place=place, actions=2 * place + random.laplace(size=place.shape))
     (changed / "spec.yaml").write_text(yaml.safe_dump(SPEC))
     environment = {**os.environ, "PYTHONPATH": str(changed)}
-    done = subprocess.run(
-        [sys.executable, "-c", ALL], cwd=changed, env=environment, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", ALL]
+    done = subprocess.run(command, cwd=changed, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.split()[-1]) == pytest.approx(stats.laplace(1, 0.5).logpdf([0, 3]).sum())
     steps = pd.read_csv(changed / "steps.csv")

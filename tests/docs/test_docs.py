@@ -1,4 +1,4 @@
-"""What the documentation shows is so, its examples, commands and keys; turns of phrase that make readers stumble."""
+"""What the documentation shows is so, its examples, commands and keys; turns that make readers stumble."""
 
 import doctest
 import re
@@ -94,8 +94,8 @@ def test_the_citation_has_the_version_of_the_package() -> None:
 
 
 TURNS = (
-    "of before", "whoever", "so it is", "told from", "nobody", "but for", "be it that", "tells? apart", "told apart",
-    "of its own accord", "as it was", "as they were",
+    "of before", "whoever", "so it is", "told from", "nobody", "but for", "be it that", "tells? apart",
+    "told apart", "of its own accord", "as it was", "as they were",
 )  # fmt: skip
 
 FILES = [

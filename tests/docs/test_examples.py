@@ -33,16 +33,11 @@ def names(tmp_path_factory):
     os.chdir(tmp_path_factory.mktemp("examples"))
     Path("mine.yaml").write_text(MINE)
     turn = np.repeat([[-2.0], [2.0]], 5, 0)
-    demos = numbered(
-        ({"place": place}, turn * place) for place in np.random.default_rng(0).normal(size=(6, 10, 2))
-    )
+    places = np.random.default_rng(0).normal(size=(6, 10, 2))
+    demos = numbered(({"place": place}, turn * place) for place in places)
     demos.write("mine.hdf5")
-    yield {
-        "ddco_pyro": ddco_pyro,
-        "np": np,
-        "demos": demos,
-        "fit": ddco_pyro.fit("mine.yaml", demos, out="runs/mine"),
-    }
+    fit = ddco_pyro.fit("mine.yaml", demos, out="runs/mine")
+    yield {"ddco_pyro": ddco_pyro, "np": np, "demos": demos, "fit": fit}
     os.chdir(before)
 
 

@@ -22,12 +22,9 @@ def sources(notebook):
 
 
 def test_every_one_is_a_pair_and_has_its_number():
-    assert [path.stem for path in NOTEBOOKS] == sorted(
-        path.stem for path in (ROOT / "notebooks").glob("*.py")
-    )
-    assert [path.stem[:2] for path in NOTEBOOKS] == [
-        f"{number:02d}" for number in range(1, len(NOTEBOOKS) + 1)
-    ]
+    names = [path.stem for path in NOTEBOOKS]
+    assert names == sorted(path.stem for path in (ROOT / "notebooks").glob("*.py"))
+    assert [name[:2] for name in names] == [f"{number:02d}" for number in range(1, len(names) + 1)]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -55,16 +52,14 @@ def test_what_a_notebook_imports_of_the_library_is_there(path):
             assert [one.name for one in node.names if not hasattr(module, one.name)] == []
 
 
-@pytest.mark.parametrize("path", [
-    pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.slow) for path in NOTEBOOKS
-])  # fmt: skip
+MARKS = {path: () if path.stem in QUICK else pytest.mark.slow for path in NOTEBOOKS}
+
+
+@pytest.mark.parametrize("path", [pytest.param(path, id=path.stem, marks=own) for path, own in MARKS.items()])
 def test_each_runs_on_small_data_from_a_fresh_clone(path, tmp_path, cache, monkeypatch):
     """No data of anybody else's lies beside the repository; fits are made anew."""
-    own = {
-        "NOTEBOOK_RUNS": str(tmp_path / "runs"),
-        "NOTEBOOK_METAWORLD": str(tmp_path / "none"),
-        "MUJOCO_GL": "egl",
-    }
+    own = {"NOTEBOOK_RUNS": str(tmp_path / "runs"), "NOTEBOOK_METAWORLD": str(tmp_path / "none")}
+    own["MUJOCO_GL"] = "egl"
     for name, value in (own | {"NOTEBOOK_SMALLER": SMALL}).items():
         monkeypatch.setenv(name, value)
     notebook = nbformat.read(path, as_version=4)

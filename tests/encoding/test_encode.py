@@ -32,7 +32,7 @@ def encoded(path, out, encoder=MEANS, **options):
 
 
 def test_components_say_where_the_dot_is(tmp_path, out):
-    """R² of the dot's place as a linear map of the features, in demonstrations that were held out of everything."""
+    """R² of the dot's place as a linear map of the features, in demonstrations held out of everything."""
     followed(24).write(tmp_path / "dots.hdf5")
     encoded(tmp_path / "dots.hdf5", out, PLACES, size=16)
     train, valid = Demonstrations.read(out).split(0.2, 0)
@@ -62,10 +62,8 @@ def test_all_but_the_pictures_stays(few_dots, out):
 def test_principal_components_are_those_of_all_rows_at_once(size):
     random = np.random.default_rng(0)
     rows = 100 + random.normal(size=(500, 9)) @ random.normal(size=(9, 9))
-    ours, theirs = (
-        principal_components(np.array_split(rows.astype(np.float32), 13), size),
-        PCA(size).fit(rows),
-    )
+    ours = principal_components(np.array_split(rows.astype(np.float32), 13), size)
+    theirs = PCA(size).fit(rows)
     projected, expected = ours(rows), theirs.transform(rows)
     np.testing.assert_allclose(projected * np.sign((projected * expected).sum(0)), expected, atol=1e-4)
     np.testing.assert_allclose(ours.explained, theirs.explained_variance_ratio_.sum(), rtol=1e-6)
@@ -91,35 +89,25 @@ def test_a_picture_that_is_seen_while_acting(few_dots, out, encoder, size):
     loaded, pictures = load(out, allow_code=True), together(Demonstrations.read(few_dots), "camera")
     one_by_one = np.stack([loaded(picture) for picture in pictures])
     assert one_by_one.dtype == np.float32
-    np.testing.assert_allclose(
-        one_by_one, together(Demonstrations.read(out), "camera_features"), rtol=1e-4, atol=1e-5
-    )
-    with pytest.raises(
-        BadInput, match=r"camera: is float64 \(20, 20, 2\); this encoder reads uint8 \(20, 20, 2\)"
-    ):
+    stored = together(Demonstrations.read(out), "camera_features")
+    np.testing.assert_allclose(one_by_one, stored, rtol=1e-4, atol=1e-5)
+    says = r"camera: is float64 \(20, 20, 2\); this encoder reads uint8 \(20, 20, 2\)"
+    with pytest.raises(BadInput, match=says):
         loaded(pictures[0] / 255)
 
 
 def test_a_second_camera_is_encoded_by_a_second_call(tmp_path, out):
     demos = followed(4)
-    both = [
-        Demonstration(
-            demo.name,
-            {"camera": demo.observations["camera"], "wrist": demo.observations["camera"]},
-            demo.actions,
-        )
-        for demo in demos
-    ]
+    cameras = [dict.fromkeys(("camera", "wrist"), demo.observations["camera"]) for demo in demos]
+    pairs = zip(demos, cameras, strict=True)
+    both = [Demonstration(demo.name, own, demo.actions) for demo, own in pairs]
     Demonstrations(tuple(both)).write(tmp_path / "both.hdf5")
     encoded(tmp_path / "both.hdf5", tmp_path / "first.hdf5", size=1)
     encode(tmp_path / "first.hdf5", out, "wrist", MEANS, size=2, allow_code=True)
     for key, size in (("camera_features", 1), ("wrist_features", 2)):
         encoder = load(out, key, allow_code=True)
-        np.testing.assert_allclose(
-            encoder(both[0].observations["camera"][0]),
-            Demonstrations.read(out)[0].observations[key][0],
-            rtol=1e-4,
-        )
+        stored = Demonstrations.read(out)[0].observations[key][0]
+        np.testing.assert_allclose(encoder(both[0].observations["camera"][0]), stored, rtol=1e-4)
         assert encoder.about.size == size
     with pytest.raises(
         BadInput, match="there is no encoder of one observation alone; there is: camera_features, wrist_f"
@@ -144,17 +132,8 @@ def test_models_of_timm(monkeypatch):
 
 
 def test_the_command(few_dots, out):
-    arguments = (
-        "encode",
-        few_dots,
-        "--observation",
-        "camera",
-        "--encoder",
-        MEANS,
-        "--allow-code",
-        "--size",
-        3,
-    )
+    options = ("--observation", "camera", "--encoder", MEANS, "--allow-code", "--size", 3)
+    arguments = ("encode", few_dots, *options)
     ended = done(*arguments, "--out", out)
     assert ended.out.startswith(f"{out}: obs/camera_features: 3 of 4 features, ")
     before = out.read_bytes()
@@ -170,23 +149,19 @@ def test_the_command(few_dots, out):
 OWN = "user_encoders:"
 
 
+NO_KEY = "there is no observation 'camra' (did you mean 'camera'?); pictures are: camera"
+MANY = "--size 129: encoder 'user_encoders:means' gives 4 features of 35 training pictures; take"
+NO_ENCODER = "there is no encoder 'resnet18'; take timm:NAME, such as timm:resnet18.a1_in1k"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            ["--observation", "camra"],
-            "there is no observation 'camra' (did you mean 'camera'?); pictures are: camera",
-        ),
-        (
-            ["--size", "129"],
-            "--size 129: encoder 'user_encoders:means' gives 4 features of 35 training pictures; take",
-        ),
+        (["--observation", "camra"], NO_KEY),
+        (["--size", "129"], MANY),
         (["--size", "60", "--encoder", PLACES], "gives 80 features of 35 training pictures; take at most 35"),
         (["--as", "place"], "obs/place is there already; choose another name with --as"),
-        (
-            ["--encoder", "resnet18"],
-            "there is no encoder 'resnet18'; take timm:NAME, such as timm:resnet18.a1_in1k",
-        ),
+        (["--encoder", "resnet18"], NO_ENCODER),
         (["--encoder", "no_such_module:encoder"], "cannot be loaded: No module named 'no_such_module'"),
         (["--encoder", f"{OWN}raises"], "fails on pictures [8, 20, 20, 2]: expected 224 x 224 pixels"),
         (["--encoder", f"{OWN}not_finite"], "gives features that are NaN or infinite"),
@@ -227,9 +202,8 @@ def test_a_damaged_encoder(few_dots, out):
     encoded(few_dots, out)
     with h5py.File(out, "r+") as file:
         file["encoders/camera_features"].attrs["about"] = "{}"
-    with pytest.raises(
-        BadInput, match=r"out\.hdf5: /encoders/camera_features is damaged .* encode the file again"
-    ):
+    says = r"out\.hdf5: /encoders/camera_features is damaged .* encode the file again"
+    with pytest.raises(BadInput, match=says):
         load(out, allow_code=True)
     with pytest.raises(BadInput, match="there is no encoder of one observation alone; there is: none"):
         load(few_dots)

@@ -1,4 +1,4 @@
-"""Measures of segments, against scikit-learn, counts of sets of steps, every matching in turn, and cases by hand."""
+"""Measures of segments, against scikit-learn, counts of sets of steps, every matching, and cases by hand."""
 
 import json
 import math
@@ -78,7 +78,7 @@ def test_measures_of_steps_are_those_of_scikit_learn_under_the_best_of_all_match
 
 
 def test_the_matching_is_one_for_all_demonstrations_or_one_for_each():
-    """Option 5 is label 0 in the first, 1 in the second. For both it is best as 1, with 7 as 0: 3 + 3 of 10 steps."""
+    """Option 5 is label 0 in the first, 1 in the second. For both, best as 1, 7 as 0: 3 + 3 of 10 steps."""
     found = measured("5555 777555", "0000 000111")
     whole, each = (found[way] for way in WAYS)
     assert whole["accuracy"] == pytest.approx(0.6)
@@ -89,13 +89,8 @@ def literal_f1(segments, labels, overlap):
     """Segmental F1 from sets of steps, under the matching that is given with them."""
     right, wrong, missed = 0, 0, 0
     for ours, theirs in zip(segments, labels, strict=True):
-        a, b = (
-            [
-                (key, {step for step, _ in run})
-                for key, run in groupby(enumerate(one), key=lambda pair: pair[1])
-            ]
-            for one in (ours, theirs)
-        )
+        runs = [groupby(enumerate(one), key=lambda pair: pair[1]) for one in (ours, theirs)]
+        a, b = ([(key, {step for step, _ in run}) for key, run in one] for one in runs)
         free = set(range(len(b)))
         for label, steps in a:
             ratios = [len(steps & other) / len(steps | other) * (label == name) for name, other in b]
@@ -133,7 +128,7 @@ def test_overlap_f1_and_boundaries_from_sets_of_steps(seed):
 
 
 def test_edit_score_by_hand():
-    """Segments A B A C for A B C: one deletion of 4. B C for A B C: one insertion of 3; A B C once more: none."""
+    """Segments A B A C for A B C: one deletion of 4. B C for A B C: one insertion of 3; the third: none."""
     found = measured("000111022222 11111222222 001122", "000111112222 00011112222 001122")
     assert found["matched_globally"]["edit"] == pytest.approx(np.mean([3 / 4, 2 / 3, 1]))
 
@@ -154,11 +149,8 @@ def test_the_table_says_where_each_label_went():
     }
 
 
-demonstrations = st.lists(
-    st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2)), min_size=1, max_size=12),
-    min_size=1,
-    max_size=4,
-)
+one_of = st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 2)), min_size=1, max_size=12)
+demonstrations = st.lists(one_of, min_size=1, max_size=4)
 
 
 def sides(pairs):
@@ -169,13 +161,10 @@ def sides(pairs):
 @given(demonstrations, st.permutations(range(4)), st.permutations(range(3)))
 def test_names_do_not_matter(pairs, options, labels):
     segments, truth = sides(pairs)
-    options, labels = (
-        np.array(options) * 3 - 4,
-        np.array([*labels, UNKNOWN - 5]) + 5,
-    )  # -1, not known, stays what it is
-    renamed = agreement(
-        [options[h] for h in segments], [np.where(one < 0, one, labels[one]) for one in truth]
-    )
+    options = np.array(options) * 3 - 4
+    labels = np.array([*labels, UNKNOWN - 5]) + 5  # -1, not known, stays what it is
+    other = [np.where(one < 0, one, labels[one]) for one in truth]
+    renamed = agreement([options[h] for h in segments], other)
     found = agreement(segments, truth)
     if found is None:
         assert renamed is None
@@ -237,9 +226,8 @@ def test_two_annotators(tmp_path):
     a = annotated(tmp_path / "a.hdf5", first, list("rgp"))
     b = annotated(tmp_path / "b.hdf5", second, list("pgr"))
     found = compare_annotators(a, b, 1)["skill"]
-    both = [
-        (x, y) for demo in "ab" for x, y in zip(first[demo], second[demo], strict=True) if "." not in (x, y)
-    ]
+    pairs = [pair for demo in "ab" for pair in zip(first[demo], second[demo], strict=True)]
+    both = [pair for pair in pairs if "." not in pair]
     assert (found.demonstrations, found.steps, found.both) == (2, 16, len(both))
     assert found.same == sum(x == y for x, y in both) == 9
     assert found.kappa == pytest.approx(cohen_kappa_score(*zip(*both, strict=True)))
@@ -257,10 +245,8 @@ def test_two_annotators(tmp_path):
 
 def test_annotators_of_other_demonstrations_are_refused(tmp_path):
     a = annotated(tmp_path / "a.hdf5", {"a": "rrr"}, ["r"])
-    for labels, why in (
-        ({"b": "rrr"}, "has none of the demonstrations of"),
-        ({"a": "rr"}, "a has 2 steps, and 3 in"),
-    ):
+    shorter = ({"a": "rr"}, "a has 2 steps, and 3 in")
+    for labels, why in (({"b": "rrr"}, "has none of the demonstrations of"), shorter):
         with pytest.raises(BadInput, match=why):
             compare_annotators(a, annotated(tmp_path / "b.hdf5", labels, ["r"]), 1)
     for missing in ((a, tmp_path / "no.hdf5"), (tmp_path / "no.hdf5", a)):

@@ -37,16 +37,15 @@ def test_use_of_options_by_sums_over_every_path():
         assert one.choice == choice
         assert one.share == pytest.approx(u[choice] / 7)
         assert one.selected == pytest.approx(v[choice])
-        assert one.demonstrations == pytest.approx(
-            sum(min(1.0, truth.v[0].sum(0)[choice]) for truth in truths)
-        )
+        expected = sum(min(1.0, truth.v[0].sum(0)[choice]) for truth in truths)
+        assert one.demonstrations == pytest.approx(expected)
         assert one.duration == pytest.approx(u[choice] / v[choice])
     assert found[0].duration == pytest.approx(1)  # control lasts one step
     assert [(one.segments, one.steps, one.length) for one in found] == [(1, 2, 2), (2, 3, 1.5), (2, 2, 1)]
 
 
 def use(*demonstrations, size=0):
-    """The use of options under a posterior that is certain: of each demonstration, segments ``(option, steps)``."""
+    """The use of options under a certain posterior: of each demonstration, segments ``(option, steps)``."""
     size = size or 1 + max(option for segments in demonstrations for option, _ in segments)
     steps = max(sum(length for _, length in segments) for segments in demonstrations)
     active, selected = (torch.zeros(len(demonstrations), steps, size, dtype=torch.float64) for _ in range(2))
@@ -56,12 +55,8 @@ def use(*demonstrations, size=0):
             active[row, start : start + length, option] = 1
             selected[row, start, option] = 1
             start += length
-    paths = [
-        [
-            np.concatenate([np.full(length, option) for option, length in segments])
-            for segments in demonstrations
-        ]
-    ]
+    runs = [[np.full(length, option) for option, length in segments] for segments in demonstrations]
+    paths = [[np.concatenate(own) for own in runs]]
     return option_use(Posterior((active,), (selected,), (active,)), paths)
 
 
@@ -84,7 +79,7 @@ def hybrid():
 
 
 def act(decision, n, t, i):
-    """The distribution of what caller i does at a step: (probabilities of the choices, Gaussian of the control)."""
+    """The distribution of what caller i does at a step: (choices' probabilities, control's Gaussian)."""
     control = torch.distributions.Normal(decision.emission.mean[n, t, i], decision.emission.std)
     return torch.distributions.Categorical(logits=decision.selection[n, t, i]), control
 
@@ -112,9 +107,8 @@ def test_divergences_of_policies_that_emit_one_kind_of_thing(hybrid):
     apart = (decision.emission.mean[:, :, 0] - decision.emission.mean[:, :, 1]) / decision.emission.std
     weight = u[..., 1] + u[..., 2]
     (found,) = divergences([(Outputs((CallerOutputs(0, None, decision.emission), decision), ()), same)])
-    assert found[0].divergence == pytest.approx(
-        float((weight * apart.square().sum(-1) / 2).sum() / weight.sum())
-    )
+    expected = (weight * apart.square().sum(-1) / 2).sum() / weight.sum()
+    assert found[0].divergence == pytest.approx(float(expected))
     options = decision.logits[..., 1:]
     (found,) = divergences([(Outputs((CallerOutputs(2, options, None), decision), ()), same)])
     p, q = (options[:, :, i].log_softmax(-1) for i in (0, 1))
@@ -132,7 +126,7 @@ def test_a_paired_difference_is_the_ratio_of_sums():
 
 
 def test_its_error_covers_the_truth_as_often_as_it_says():
-    """Repeated draws of demonstrations of unequal length: the spread of the estimate is the standard error."""
+    """Repeated draws of demonstrations of unequal length: the estimate's spread is the standard error."""
     random = np.random.default_rng(2)
     found = []
     for _ in range(400):
@@ -161,9 +155,9 @@ DEMOS = numbered(
 def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
     """Random networks that differ between options; σ of each level is its own."""
     above = LINEAR | {"emits": list(emits)}
-    levels = [
-        {"name": f"level-{d}", "count": k, "policy": above if d else LINEAR} for d, k in enumerate(counts)
-    ]
+    policies = [above if d else LINEAR for d in range(len(counts))]
+    each = enumerate(zip(counts, policies, strict=True))
+    levels = [{"name": f"level-{d}", "count": k, "policy": policy} for d, (k, policy) in each]
     options = {"hierarchy": {"levels": levels, "meta_policy": above}} if counts else {}
     spec = small_spec(counts, observations=["pose"], control={"std": {"learn": True}}, **options)
     torch.manual_seed(1)
@@ -176,16 +170,12 @@ def make(counts: tuple[int, ...], emits: tuple[str, ...]) -> Hierarchy:
     return hierarchy.eval()
 
 
-@pytest.mark.parametrize(
-    ("counts", "emits"),
-    [
-        ((), ("control",)),
-        ((3,), ("options",)),
-        ((2,), ("options", "control")),
-        ((2, 2), ("options", "control")),
-    ],
-    ids=["flat", "options", "hybrid", "two hybrid levels"],
-)
+BOTH = ("options", "control")
+HIERARCHIES = [((), ("control",)), ((3,), ("options",)), ((2,), BOTH), ((2, 2), BOTH)]
+NAMES = ["flat", "options", "hybrid", "two hybrid levels"]
+
+
+@pytest.mark.parametrize(("counts", "emits"), HIERARCHIES, ids=NAMES)
 def test_parts_are_those_of_every_path_so_far(counts: tuple[int, ...], emits: tuple[str, ...]) -> None:
     hierarchy = make(counts, emits)
     batch = encode(DEMOS, hierarchy.encoder, hierarchy.scaling)
@@ -213,9 +203,7 @@ def _actor(choices: tuple[int, ...]) -> tuple[int, int]:
     return next(((level, choice - 1) for level, choice in enumerate(choices) if choice), (len(choices), 0))
 
 
-def _densities(
-    hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int
-) -> dict[tuple[int, int], np.ndarray]:
+def _densities(hierarchy: Hierarchy, outputs: Outputs, batch: Batch, n: int):
     """log N(a_td; μ_d, σ_d²) of each caller, [T, A'], with scipy and in the control's own units."""
     shift, scale = hierarchy.scaling.shift.numpy(), hierarchy.scaling.scale.numpy()
 
@@ -239,18 +227,9 @@ def _densities(
 def level(*shares, durations=None):
     """Options that are selected ten times in each of two demonstrations."""
     durations = durations or [5.0] * len(shares)
-    return [
-        Use.model_construct(
-            choice=choice,
-            share=share,
-            selected=20.0,
-            demonstrations=2.0,
-            duration=duration,
-            having=2,
-            within=None,
-        )
-        for choice, (share, duration) in enumerate(zip(shares, durations, strict=True))
-    ]
+    alike = {"selected": 20.0, "demonstrations": 2.0, "having": 2, "within": None}
+    each = enumerate(zip(shares, durations, strict=True))
+    return [Use.model_construct(choice=n, share=share, duration=own, **alike) for n, (share, own) in each]
 
 
 def short(option, selections, duration=1.0):
@@ -263,6 +242,9 @@ def whole(option, having, share=1.0):
 
 def lasting(duration):
     return [level(0.0, 0.5, 0.5, durations=[None, duration, 5.0])]
+
+
+UNUSED = Finding("unused", 1, 1, 0.001)
 
 
 @pytest.mark.parametrize(
@@ -278,10 +260,7 @@ def lasting(duration):
         ([level(0.5, 0.25, 0.25, durations=[1.0, 5.0, 5.0])], []),
         ([level(0.51, 0.245, 0.245, durations=[1.0, 5.0, 5.0])], [Finding("high_fitting", 1, 0, 0.51)]),
         # an unused option is not also said to be short
-        (
-            [level(0.0, 0.001, 0.4995, 0.4995, durations=[None, 1.0, 5.0, 5.0])],
-            [Finding("unused", 1, 1, 0.001)],
-        ),
+        ([level(0.0, 0.001, 0.4995, 0.4995, durations=[None, 1.0, 5.0, 5.0])], [UNUSED]),
         # the meta-policy does all the work of option 1, which ends at once and is selected again; option 2
         # lasts
         (use(*[[(1, 1)] * 6 + [(2, 6)]] * 4), [short(1, 6.0)]),
@@ -313,16 +292,13 @@ def test_signs_of_a_degenerate_solution(levels, found):
     ],
 )
 def test_options_that_switch_all_the_time_are_a_sign(lengths, rate, brief):
-    """Half a second where the rate is known, else five steps, or a fiftieth of the demonstration if that is more."""
+    """Half a second where the rate is known, else five steps, or a fiftieth of a demonstration if longer."""
     path = np.concatenate([np.full(steps, 1 + n % 2) for n, steps in enumerate(lengths)])
     segments = segments_of([path, path], rate)
     least = 0.5 * rate if rate else max(5, len(path) / 50)
     twitches = sum(steps < least for steps in lengths)
-    assert (segments.median, segments.number, segments.twitches) == (
-        np.median(lengths),
-        2 * len(lengths),
-        2 * twitches,
-    )
+    numbers = (np.median(lengths), 2 * len(lengths), 2 * twitches)
+    assert (segments.median, segments.number, segments.twitches) == numbers
     found = [one for one in diagnose([level(0.0, 0.5, 0.5)], segments=[segments]) if one.kind == "brief"]
     assert found == (
         [Finding("brief", 1, 0, float(np.median(lengths)), times=twitches / len(lengths))] if brief else []
@@ -334,22 +310,19 @@ def test_an_option_of_most_steps_of_some_demonstrations_is_a_sign(demonstrations
     """Two thirds count where no more than half of the demonstrations have the option."""
     own = use([(1, 300), (2, 130)], [(2, 40)])[0]
     own[1] = own[1].model_copy(update={"having": 24})
-    signs = diagnose(
-        [own], segments=[Segments(median=100, number=200, demonstrations=demonstrations, twitches=0)]
-    )
+    segments = Segments(median=100, number=200, demonstrations=demonstrations, twitches=0)
+    signs = diagnose([own], segments=[segments])
     assert [one.kind for one in signs] == (["whole"] if found else [])
 
 
-@pytest.mark.parametrize(
-    ("training", "clusters"),
-    [
-        ({"starts": ["equal_parts"]}, True),
-        ({"starts": ["random"]}, True),
-        ({"starts": ["vq_controls"]}, False),
-        ({"starts": ["equal_parts"], "labels": {"level": "option", "from": "phase"}}, False),
-    ],
-)
-def test_clusters_are_advised_where_neither_they_nor_labels_start(
+LABELLED = {"starts": ["equal_parts"], "labels": {"level": "option", "from": "phase"}}
+ADVISED = [
+    ({"starts": [start]}, start != "vq_controls") for start in ("equal_parts", "random", "vq_controls")
+]
+
+
+@pytest.mark.parametrize(("training", "clusters"), [*ADVISED, (LABELLED, False)])
+def test_clusters_are_advised_where_nothing_like_them_starts(
     training: dict[str, Any], clusters: bool
 ) -> None:
     for kind in ("unused", "redundant", "dominating"):

@@ -11,14 +11,8 @@ from ddco_pyro.report import write_report
 from ddco_pyro.spec import parse_spec
 
 HEADS = {"policy": {"network": "linear"}, "termination": {"network": "linear"}}
-BRANCHES = {
-    "network": "branches",
-    "of": {
-        "seen": {"network": "mlp", "hidden": [8]},
-        "noise": {"network": "mlp", "hidden": [8], "activation": "tanh"},
-    },
-    "hidden": [16],
-}
+MLP = {"network": "mlp", "hidden": [8]}
+BRANCHES = {"network": "branches", "of": {"seen": MLP, "noise": MLP | {"activation": "tanh"}}, "hidden": [16]}
 
 
 def demonstrations(number=12, steps=20):
@@ -32,16 +26,13 @@ def demonstrations(number=12, steps=20):
 
 
 def spec_of(level, trunk):
+    levels = [{"count": 2, **level}]
     return parse_spec(
         {
             "demonstrations": {"path": "unused.hdf5", "valid_fraction": 0.25},
             "observations": ["seen", "noise"],
             "control": {"std": {"learn": True}},
-            "hierarchy": {
-                "trunk": trunk,
-                "levels": [{"count": 2, **level}],
-                "meta_policy": {"network": "linear"},
-            },
+            "hierarchy": {"trunk": trunk, "levels": levels, "meta_policy": {"network": "linear"}},
             "training": {"epochs": 60, "optimizer": {"lr": 0.03}, "layerwise": False},
         }
     )
@@ -51,9 +42,8 @@ def spec_of(level, trunk):
 def fitted(request, tmp_path_factory):
     level = HEADS if request.param == "whole" else {"policy": BRANCHES}
     out = tmp_path_factory.mktemp("runs") / request.param
-    return ddco_pyro.fit(
-        spec_of(level, BRANCHES if request.param == "whole" else None), demonstrations(), out=out
-    )
+    trunk = BRANCHES if request.param == "whole" else None
+    return ddco_pyro.fit(spec_of(level, trunk), demonstrations(), out=out)
 
 
 def test_what_decides_the_control_is_told_from_what_does_not(fitted):

@@ -1,4 +1,4 @@
-"""Models that are compared have the same budget, one of them the same size, and who needed more of it is named."""
+"""Models that are compared have one budget, one of them the same size, and who needed more of it is named."""
 
 import json
 import re
@@ -42,15 +42,12 @@ OWN = {"kind": "flat", "policy": {"hidden": [8]}, "optimizer": {"lr": 0.03}}
 def test_a_baseline_beside_trains_as_it_would_alone(toy_spec, tmp_path):
     """What its own optimiser does not say is as in the spec's."""
     shared = {"training.optimizer.weight_decay": 0.01, "training.epochs": 4}
-    beside = fit(
-        with_overrides(toy_spec, shared | {"compare_with": [OWN]}), out=tmp_path / "beside"
-    ).baselines["flat"]
+    own = with_overrides(toy_spec, shared | {"compare_with": [OWN]})
+    beside = fit(own, out=tmp_path / "beside").baselines["flat"]
     alone = {"hierarchy": None, "baseline": {**OWN, "optimizer": None}, "compare_with": []}
     spec = with_overrides(toy_spec, shared | alone | {"training.optimizer.lr": 0.03})
-    assert (
-        beside.metrics.log_likelihood_per_step
-        == fit(spec, out=tmp_path / "alone").metrics.log_likelihood_per_step
-    )
+    apart = fit(spec, out=tmp_path / "alone").metrics
+    assert beside.metrics.log_likelihood_per_step == apart.log_likelihood_per_step
     assert beside.spec.training == spec.training
 
 
@@ -63,9 +60,8 @@ def perceptron(hidden, inputs=5, outputs=2):
 def test_widths_are_the_nearest_of_all(hidden):
     """Of every width that the widest layer can have, the others in proportion."""
     widest = max(hidden)
-    candidates = [
-        tuple(max(1, round(size * width / widest)) for size in hidden) for width in range(1, 20_000)
-    ]
+    scales = [width / widest for width in range(1, 20_000)]
+    candidates = [tuple(max(1, round(size * scale)) for size in hidden) for scale in scales]
     counts = [perceptron(sizes) for sizes in candidates]
     for target in (1, 8, 37, 300, 5000, 123_456):
         nearest = min(range(len(counts)), key=lambda n: abs(counts[n] - target))
@@ -98,14 +94,11 @@ def test_candidates_of_a_selection_have_the_same_budget(tmp_path):
     """One level of options or two: four stages or six."""
     level = {"count": 2, "policy": {"network": "linear"}, "termination": {"network": "linear"}}
     upper = {**level, "name": "upper", "policy": {"network": "linear", "emits": ["options"]}}
-    spec = spec_at(
-        tmp_path, folds=2, grid={"hierarchy.levels": [[level], [level, upper]], "training.epochs": [13]}
-    )
+    grid = {"hierarchy.levels": [[level], [level, upper]], "training.epochs": [13]}
+    spec = spec_at(tmp_path, folds=2, grid=grid)
     found = select(spec, tmp_path / "run", Told(), Workers(1))
-    assert [row.gradient_steps for row in found.choice.rows] == [
-        13.0,
-        13.0,
-    ]  # five to train with are one minibatch
+    # five to train with are one minibatch
+    assert [row.gradient_steps for row in found.choice.rows] == [13.0, 13.0]
     assert [len(row.unconverged) for row in found.choice.rows] == [2, 2]  # in both folds
 
 
@@ -117,14 +110,12 @@ def test_stages_that_needed_more_are_named_on_the_console(fitted):
         assert re.search(rf" {method(name)} │[^┃]*│ 27, not converged ", said)
         for stage in training.stages:
             rise = f"{stage.rising:.2f} nats per step over the last {stage.epochs})"
-            assert (
-                f"stage {stage.stage} after {stage.epochs} epochs (tuning log-likelihood up by {rise}" in said
-            )
+            ended = f"stage {stage.stage} after {stage.epochs} epochs"
+            assert f"{ended} (tuning log-likelihood up by {rise}" in said
     assert said.count("warning: ") >= 4
     assert "warning: Options have not converged: the budget ended stage vq-1 after 2 epochs" in said
-    assert (
-        "warning: Flat of equal size has not converged: the budget ended stage policy after 9 epochs" in said
-    )
+    policy = "Flat of equal size has not converged: the budget ended stage policy after 9 epochs"
+    assert f"warning: {policy}" in said
 
 
 def test_a_comparison_marks_them(fitted, tmp_path):

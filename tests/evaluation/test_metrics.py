@@ -21,9 +21,8 @@ def demonstrations(number):
     random, each = np.random.default_rng(0), []
     for n in range(number):
         seen = random.uniform(-2, 2, size=(6 + n, 1))
-        each.append(
-            Demonstration(f"demo_{n}", {"state": seen}, np.abs(seen) + 0.1 * random.normal(size=seen.shape))
-        )
+        controls = np.abs(seen) + 0.1 * random.normal(size=seen.shape)
+        each.append(Demonstration(f"demo_{n}", {"state": seen}, controls))
     return Demonstrations(tuple(each))
 
 

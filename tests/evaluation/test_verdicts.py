@@ -70,29 +70,24 @@ def test_a_baseline_that_fell_apart_comes_last_with_advice_for_itself(capsys):
     metrics = scored({"ddco": 2.0, "flat": 9.0}, {"ddco": around(1.0), "flat": around(0.5)}, -2.0, 2)
     assert verdicts.doubts(metrics) == []
     ((text, advice),) = verdicts.faults(metrics)
-    assert text.startswith(
-        "Flat fell apart on held-out demonstrations: 0.50 nats per step there, 9.00 in training."
-    )
+    says = "Flat fell apart on held-out demonstrations: 0.50 nats per step there, 9.00 in training."
+    assert text.startswith(says)
     assert "this baseline" in advice
-    assert verdicts.verdict(metrics).index("Options explain") < verdicts.verdict(metrics).index(
-        "Flat fell apart"
-    )
+    said = verdicts.verdict(metrics)
+    assert said.index("Options explain") < said.index("Flat fell apart")
     assert text in console_says(metrics, capsys)
 
 
 def test_a_model_below_simpler_ones_is_doubtful():
-    """It loses nothing on held-out demonstrations, yet a mean and a spread, or a flat policy, predict better."""
+    """It loses nothing on held-out demonstrations, yet a mean and spread, or a flat one, predict better."""
     text = verdicts.verdict(scored({"ddco": -3.0}, {"ddco": around(-3.0)}, -1.0, 2))
-    assert text.startswith(
-        "Options predict held-out controls worse than the mean and the spread of each control do: "
-    )
-    text = verdicts.verdict(
-        scored({"ddco": 1.1, "flat": 1.5}, {"ddco": around(1), "flat": around(1.4, 2)}, -2.0, 2)
-    )
+    says = "Options predict held-out controls worse than the mean and the spread of each control do: "
+    assert text.startswith(says)
+    held_out = {"ddco": around(1), "flat": around(1.4, 2)}
+    text = verdicts.verdict(scored({"ddco": 1.1, "flat": 1.5}, held_out, -2.0, 2))
     error = np.std(TEN, ddof=1) / np.sqrt(10)
-    assert text.startswith(
-        f"Options are below flat by 0.40 ± {error:.2f} nats per step on held-out demonstrations. T"
-    )
+    says = f"Options are below flat by 0.40 ± {error:.2f} nats per step on held-out demonstrations. T"
+    assert text.startswith(says)
 
 
 @pytest.mark.parametrize(("nats", "controls", "told"), [(0.02, 7, False), (0.02, 1, True), (0.08, 7, True)])
@@ -100,7 +95,8 @@ def test_a_mixture_that_leads_in_training_by_what_nobody_acts_on_is_no_doubt(nat
     """A control has to be 1 % more probable under the mixture."""
     below = {"mixture": {"objective": nats, "nats": 0.0}}
     metrics = scored({"ddco": 1.0}, {"ddco": around(1.0)}, -2.0, controls, below=below)
-    said = f"In training options are less likely than the mixture that they contain, by {nats:.2f} nats per step."
+    said = "In training options are less likely than the mixture that they contain, by "
+    said += f"{nats:.2f} nats per step."
     assert [text for text, _ in verdicts.doubts(metrics)] == [said] * told
 
 
@@ -112,22 +108,19 @@ def test_few_demonstrations_that_are_each_left_out_are_said_to_be_few(left_out, 
         verdicts.verdict(scored({"ddco": 6.0}, {"ddco": around(value)}, -4.0, 2, demonstrations=counts))
         for value in (-16.0, 5.5)
     )
-    said = f" {train} demonstrations are too few here: each held-out one leaves {train - 1} to train with. Record at "
+    said = f" {train} demonstrations are too few here: each held-out one leaves {train - 1} to train with."
     assert (said in apart) == few
     assert "too few" not in sound
 
 
 @pytest.mark.parametrize("kind", ["auto", "gaussian"])
 def test_the_density_without_observations_has_the_means_and_spreads_of_training(kind):
-    """A Gaussian control and a switch, beside scipy's densities with the moments of the training demonstrations."""
+    """A Gaussian control and a switch, beside scipy's densities with the moments of what trains."""
     random = np.random.default_rng(0)
-    rows = [
-        (
-            {"seen": random.normal(size=(30, 2))},
-            np.stack([random.normal(3, 2, 30), random.random(30) < 0.3], 1) * 1.0,
-        )
-        for _ in range(12)
-    ]
+    rows = []
+    for _ in range(12):
+        seen = {"seen": random.normal(size=(30, 2))}
+        rows.append((seen, np.stack([random.normal(3, 2, 30), random.random(30) < 0.3], 1) * 1.0))
     spec = small_spec(
         (),
         demonstrations={"path": "unused.hdf5", "valid_fraction": 0.25},
@@ -155,9 +148,8 @@ def test_the_density_without_observations_has_the_means_and_spreads_of_training(
 def memory(mean, error, held_out=10, **more):
     """A run with a mixture beside it."""
     lead = {"nats_per_step": mean, "standard_error": error}
-    return made_metrics(
-        held_out, worth={"memory": lead}, comparison={"mixture": compared(mean, error)}, **more
-    )
+    worth, comparison = {"memory": lead}, {"mixture": compared(mean, error)}
+    return made_metrics(held_out, worth=worth, comparison=comparison, **more)
 
 
 SEEDS = {"training_seeds": [0, 1, 2], "held_out": {"ddco": [1.0, 1.1, 1.2]}}
@@ -171,7 +163,8 @@ LASTING = {
     "better": "options that last predict held-out controls better than the mixture does: ",
     "worse": "options that last predict held-out controls worse than the mixture does: ",
     "same": "options that last predict held-out controls as well as the mixture does: ",
-    "unclear": "it is inconclusive whether options that last predict held-out controls better than the mixture does: ",
+    "unclear": "it is inconclusive whether options that last predict held-out controls better than the "
+    "mixture does: ",
 }
 
 
@@ -196,14 +189,11 @@ def test_one_fit_says_what_was_measured(mean, error, way, lead, capsys):
 def test_one_or_two_held_out_demonstrations_say_nothing_of_significance(held_out, seeds):
     error = None if held_out == 1 else 0.001
     text = verdicts.verdict(memory(0.5, error, held_out, seeds=seeds))
-    assert (
-        f"Too few demonstrations ({held_out}) are held out to compare options that last with the mixture"
-        in text
-    )
+    held = f"({held_out}) are held out to compare options that last with the mixture"
+    assert f"Too few demonstrations {held}" in text
     assert not {"±", "["} & {*text}
-    assert not any(
-        word in text for word in ("predict held-out controls better", "no clear difference", "significant")
-    )
+    words = ("predict held-out controls better", "no clear difference", "significant")
+    assert not any(word in text for word in words)
 
 
 @pytest.mark.parametrize(
@@ -245,39 +235,19 @@ def test_very_short_options_are_not_said_to_last(brief, capsys):
             assert ("options that last predict" in said) != brief
 
 
+MORE = "options succeed more often than the mixture:"
+LESS = "options succeed less often than the mixture:"
+UNKNOWN = "it is inconclusive whether options succeed more often than"
+
+
 @pytest.mark.parametrize(
     ("only", "others", "seeds", "said"),
     [
-        (
-            9,
-            1,
-            None,
-            "In this fit options succeed more often than the mixture: +8 (p = 0.021) of 50 episodes.",
-        ),
-        (
-            1,
-            9,
-            None,
-            "In this fit options succeed less often than the mixture: −8 (p = 0.021) of 50 episodes.",
-        ),
-        (
-            5,
-            4,
-            None,
-            "In this fit it is inconclusive whether options succeed more often than the mixture: +1 (p =",
-        ),
-        (
-            20,
-            0,
-            [0.4, 0.41, 0.42],
-            "Over 3 training seeds options succeed more often than the mixture: +41 [",
-        ),
-        (
-            5,
-            4,
-            [0.02, 0.1, -0.1],
-            "Over 3 training seeds it is inconclusive whether options succeed more often than",
-        ),
+        (9, 1, None, f"In this fit {MORE} +8 (p = 0.021) of 50 episodes."),
+        (1, 9, None, f"In this fit {LESS} −8 (p = 0.021) of 50 episodes."),
+        (5, 4, None, f"In this fit {UNKNOWN} the mixture: +1 (p ="),
+        (20, 0, [0.4, 0.41, 0.42], f"Over 3 training seeds {MORE} +41 ["),
+        (5, 4, [0.02, 0.1, -0.1], f"Over 3 training seeds {UNKNOWN}"),
     ],
 )
 def test_success_is_told_where_it_was_measured(only, others, seeds, said):
@@ -295,6 +265,9 @@ def test_success_is_told_where_it_was_measured(only, others, seeds, said):
     assert "not measured" not in text
 
 
+ALONE = "0.10 nats per step better than flat (1 held-out demonstration is too few for an error; one"
+
+
 @pytest.mark.parametrize(
     ("mean", "error", "held_out", "said"),
     [
@@ -303,12 +276,7 @@ def test_success_is_told_where_it_was_measured(only, others, seeds, said):
         (0.1, 0.05, 10, "with no clear difference from flat (+0.10 ± 0.05 nats per step)"),
         (0.1, 0.04, 100, "0.10 ± 0.04 nats per step better than flat"),
         (0.1, 0.04, 3, "with no clear difference from flat"),
-        (
-            0.1,
-            None,
-            1,
-            "0.10 nats per step better than flat (1 held-out demonstration is too few for an error; one",
-        ),
+        (0.1, None, 1, ALONE),
     ],
 )
 def test_a_lead_has_its_error(mean, error, held_out, said):
@@ -332,9 +300,8 @@ def test_equal_parts_that_agree_better_are_a_sign():
         return [said for said, _ in degeneracies(found, spec, {"skill": []})]
 
     (said,) = signs(train=0.9, equal_train=0.2, valid=0.41, equal_valid=0.52)
-    assert said.startswith(
-        "Equal parts of each demonstration agree better with labels “phase” than options do: NMI 0"
-    )
+    says = "Equal parts of each demonstration agree better with labels “phase” than options do: NMI 0"
+    assert said.startswith(says)
     assert said.endswith("held out.")
     (said,) = signs(train=0.41, equal_train=0.52)
     assert said.endswith("in training.")

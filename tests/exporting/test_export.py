@@ -111,6 +111,8 @@ BRANCHES = {
 }
 SMALL = {"camera": {"resize": [7, 6]}, "built_in": ("step",)}
 BOTH = ("options", "control")
+AFTER = {"network": "linear", "inputs": ["step", "goal"]}
+OVER = {"network": "lstm", "over": CONVOLUTIONS}
 FITS = {
     "linear": make("linear", options="most_likely"),
     "mlp": make("mlp", control="sample", options="sample"),
@@ -126,22 +128,11 @@ FITS = {
     "memoryless below": make("mlp", (2, 3), endings="always", options="marginal"),
     "flat": make("mlp", (), built_in=("step",)),
     "lstm": make(RECURRENT, (2, 2), BOTH, endings=RECURRENT, control="sample"),
-    "lstm over pictures": make(
-        {"network": "lstm", "over": CONVOLUTIONS},
-        camera=True,
-        endings=CONVOLUTIONS,
-        steps=30,
-        options="sample",
-    ),
+    "lstm over pictures": make(OVER, camera=True, endings=CONVOLUTIONS, steps=30, options="sample"),
     "trunk": make("mlp", (2, 3), BOTH, trunk=BRANCHES, options="sample", **SMALL),
     "branches": make(BRANCHES, (2, 3), BOTH, endings={"network": "linear", "inputs": ["state"]}, **SMALL),
     "pictures alone": make(LEAKY, camera=True, endings=LEAKY, vectors=False, options="sample"),
-    "several convolutions": make(
-        CONVOLUTIONS,
-        camera=True,
-        endings={"network": "linear", "inputs": ["step", "goal"]},
-        built_in=("step",),
-    ),
+    "several convolutions": make(CONVOLUTIONS, camera=True, endings=AFTER, built_in=("step",)),
 }
 
 PROGRAMS = ("trunk", "conv", "lstm", "branches", "σ of the state", "per_timestep", "constant")
@@ -152,7 +143,7 @@ PROGRAMS = ("trunk", "conv", "lstm", "branches", "σ of the state", "per_timeste
     "name", [pytest.param(name, marks=pytest.mark.slow if name != PROGRAMS[0] else ()) for name in PROGRAMS]
 )
 def test_every_form_acts_as_the_controller_does(name, tmp_path):
-    """On other observations than those that it was compared on when it was written, past the longest demonstration."""
+    """On other observations than it was compared on when written, past the longest demonstration."""
     forms(name, tmp_path, ["numpy", "onnx"])
 
 
@@ -232,16 +223,16 @@ def test_each_form_runs_without_this_library(exported, form):
     assert ended.stdout.startswith("largest difference: ")
 
 
+TEXT = {"offsets": np.array(list("abcd")), "visited": np.zeros(1)}
+
+
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
         ({"visited": np.zeros(1)}, r"the observation has no 'offsets' \(it has: visited\)"),
         ({"offsets": np.zeros(3), "visited": np.zeros(1)}, r"'offsets' has shape \(3,\), the demonst"),
         ({"offsets": np.full(4, np.nan), "visited": np.zeros(1)}, "'offsets' is not finite"),
-        (
-            {"offsets": np.array(list("abcd")), "visited": np.zeros(1)},
-            "'offsets' is <U1, it has to be numbers",
-        ),
+        (TEXT, "'offsets' is <U1, it has to be numbers"),
     ],
 )
 def test_both_refuse_the_same_observations(exported, toy_run, observation, message):
@@ -287,20 +278,21 @@ MANY = make("linear", (200,), options="most_likely")
 LONG = make("per_timestep", (), steps=30)
 
 
+OTHERS, FAR = ".*; with networks", r"1\.0e-03, of 1\.0e-06 that"
+
+
 @pytest.mark.parametrize(
     ("fit", "tensor", "by", "message"),
     [
-        pytest.param(MANY, "networks.caller_0.layers.0.bias", 1e-3, ".*; with networks", id="policies"),
-        pytest.param(MANY, "networks.caller_1.layers.0.bias", np.nan, ".*; with networks", id="selections"),
-        pytest.param(MANY, "networks.end_0.layers.0.bias", 1e-3, ".*; with networks", id="terminations"),
-        pytest.param(
-            LONG, "networks.caller_0.layers.1.bias", 1e-3, r"1\.0e-03, of 1\.0e-06 that", id="steps"
-        ),
+        pytest.param(MANY, "caller_0.layers.0.bias", 1e-3, OTHERS, id="policies"),
+        pytest.param(MANY, "caller_1.layers.0.bias", np.nan, OTHERS, id="selections"),
+        pytest.param(MANY, "end_0.layers.0.bias", 1e-3, OTHERS, id="terminations"),
+        pytest.param(LONG, "caller_0.layers.1.bias", 1e-3, FAR, id="steps"),
     ],
 )
 def test_every_network_of_every_option_and_step_is_compared(fit, tensor, by, message, tmp_path, damaged):
     """Though of 200 options most are active in no step, and of 30 steps' networks the last alone differs."""
-    damaged(lambda folder: damage_numpy(folder, tensor, by))
+    damaged(lambda folder: damage_numpy(folder, f"networks.{tensor}", by))
     with pytest.raises(Failed, match=rf"^nothing was written: as numpy it differs from the run by {message}"):
         export(fit, tmp_path / "out")
 
@@ -330,9 +322,8 @@ def test_what_was_exported_before_is_replaced_by_what_agrees_alone(tmp_path, dam
 
 def test_what_else_is_in_a_folder_is_not_lost(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(
-        BadInput, match=r": holds what was not exported, such as notes\.txt; choose another --out$"
-    ):
+    says = r": holds what was not exported, such as notes\.txt; choose another --out$"
+    with pytest.raises(BadInput, match=says):
         export(make("linear"), tmp_path)
     with pytest.raises(BadInput, match=r"notes\.txt: is a file; choose another --out$"):
         export(make("linear"), tmp_path / "notes.txt")
@@ -357,9 +348,8 @@ class Inner(torch.nn.Module):
 def test_networks_that_numpy_cannot_evaluate_are_compared_as_a_program(tmp_path):
     fit = make("linear")
     fit.hierarchy.meta_policy.network = UserNetwork(Inner(fit.hierarchy.meta_policy.network), 3, 1)
-    with pytest.raises(
-        BadInput, match=r"networks that numpy cannot evaluate; export it with --out and --onnx$"
-    ):
+    says = r"networks that numpy cannot evaluate; export it with --out and --onnx$"
+    with pytest.raises(BadInput, match=says):
         export(fit, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
     assert list(export(fit, tmp_path / "out", onnx=True)) == ["onnx"]
@@ -440,9 +430,8 @@ def measured(folder: Path) -> float:
     (``control_0``), and what it did (``controls``), one step after the other.
     """
     with np.load(folder / "weights.npz") as file:
-        names = [
-            f"networks.caller_0.layers.{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")
-        ]
+        parts = [f"{layer}.{part}" for layer in (0, 1) for part in ("weight", "bias")]
+        names = [f"networks.caller_0.layers.{part}" for part in parts]
         weight, bias, weight_2, bias_2 = (file[name][0].astype(np.float64) for name in names)
     largest = 0.0
     with np.load(folder / "check.npz") as file:
@@ -450,9 +439,8 @@ def measured(folder: Path) -> float:
             seen = file[f"observation_{episode}_state"].astype(np.float32).astype(np.float64)
             exact = np.maximum(seen @ weight + bias, 0) @ weight_2 + bias_2
             for name in ("control_0", "controls"):
-                error = np.abs(file[f"{name}_{episode}"].reshape(exact.shape) - exact) / np.maximum(
-                    1, np.abs(exact)
-                )
+                found = file[f"{name}_{episode}"].reshape(exact.shape)
+                error = np.abs(found - exact) / np.maximum(1, np.abs(exact))
                 largest = max(largest, error.max())
     return largest
 

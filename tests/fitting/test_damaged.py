@@ -60,14 +60,12 @@ def test_damaged_metrics(run: Path) -> None:
     many = whole.replace('"parameters": ', '"parameters": "many", "was": ')
     (table,) = data["agreement"]["confusion"]
     tables = {**data["agreement"], "confusion": [{**table, "steps": table["steps"][:-1]}]}
+    of_options = json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]})
     for content, what in (
         (whole[: len(whole) // 2], "is no JSON: EOF while parsing"),
         ("[]", "must be a mapping (key: value), got []"),
         (many, "comparison.flat.parameters: must be a whole number, got 'many'"),
-        (
-            json.dumps(data | {"options": [[*data["options"][0], data["options"][0][-1]]]}),
-            "is not about levels with 2",
-        ),
+        (of_options, "is not about levels with 2"),
         (json.dumps(data | {"agreement": tables}), "agreement.confusion.0: is no table of labels by options"),
         ('{"model": NaN}', ""),
     ):
@@ -80,9 +78,7 @@ def test_damaged_metrics(run: Path) -> None:
     refused(run, COMMANDS["report"], run / "baselines" / "flat" / "metrics.json", "model: missing")
 
 
-def test_every_command_refuses_damaged_metrics_and_a_damaged_model(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_command_refuses_damaged_metrics_and_a_damaged_model(run: Path, monkeypatch) -> None:
     monkeypatch.chdir(run.parent)
     metrics, model = run / "metrics.json", run / "model.safetensors"
     whole, content = metrics.read_text(), model.read_bytes()
@@ -103,9 +99,10 @@ def test_weights_that_are_not_finite(run: Path, monkeypatch: pytest.MonkeyPatch)
     for model, value in ((".", float("nan")), ("baselines/flat", float("inf"))):
         path = run / model / "model.safetensors"
         content, (tensors, metadata) = path.read_bytes(), read_tensors(path)
-        name = next(
+        several = (
             name for name, one in sorted(tensors.items()) if one.is_floating_point() and one.numel() > 1
         )
+        name = next(several)
         tensors[name].view(-1)[1] = value
         write_tensors(path, tensors, metadata)
         refused(run, COMMANDS["compare"], path, f"{name} has numbers that are NaN or infinite")
@@ -141,9 +138,7 @@ def test_what_is_removed_is_made_again(run: Path) -> None:
         ("history.csv", b"a\n1\n", "report"),
     ],
 )
-def test_a_damaged_table(
-    run: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, command: str
-) -> None:
+def test_a_damaged_table(run: Path, monkeypatch, name: str, content: bytes, command: str) -> None:
     monkeypatch.chdir(run.parent)
     (run / "videos").mkdir(exist_ok=True)
     (run / "videos" / "ddco-1000.mp4").touch()  # a film, whose outcome is in the table

@@ -23,20 +23,18 @@ from ddco_pyro.fitting.digest import difference, digest
 from ddco_pyro.spec import Spec, parse_spec
 
 REFUSED = (
-    "{folder}: is a run of other demonstrations ({what}); bring back those that it was fitted to, or choose another "
-    "--out for these"
+    "{folder}: is a run of other demonstrations ({what}); bring back those that it was fitted to, or choose "
+    "another --out for these"
 )
 
 
 def labelled() -> Demonstrations:
     """With a label that is used, one that is not, and a mask."""
     demos = two_skills()
-    records = tuple(
-        replace(
-            one, labels={"phase": (np.arange(len(one)) > 3).astype(int), "other": np.zeros(len(one), int)}
-        )
-        for one in demos
-    )
+    labels = [
+        {"phase": (np.arange(len(one)) > 3).astype(int), "other": np.zeros(len(one), int)} for one in demos
+    ]
+    records = tuple(replace(one, labels=own) for one, own in zip(demos, labels, strict=True))
     return Demonstrations(records, {"valid": demos.names[:3], "few": demos.names[:2]})
 
 
@@ -57,24 +55,28 @@ def edited(path: Path, edit: Callable[[h5py.File], object]) -> None:
         edit(file)
 
 
+OBS = "data/demo_4/obs"
+
+
+def both_of(file: h5py.File) -> None:
+    for key in ("place", "turn"):
+        file[f"{OBS}/{key}"][0, 0] = 7.0
+
+
+def renamed(file: h5py.File) -> None:
+    for n in (4, 5):
+        file.move(f"data/demo_{n}", f"data/new_{n}")
+
+
 CHANGES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "a control": (lambda file: file["data/demo_4/actions"].write_direct(np.ones((9, 2))), "actions changed"),
-    "an observation": (
-        lambda file: file["data/demo_4/obs/turn"].__setitem__((0, 0), 7.0),
-        "obs/turn changed",
-    ),
-    "two observations": (
-        lambda file: [file[f"data/demo_4/obs/{key}"].__setitem__((0, 0), 7.0) for key in ("place", "turn")],
-        "obs/place and obs/turn changed",
-    ),
+    "an observation": (lambda file: file[f"{OBS}/turn"].__setitem__((0, 0), 7.0), "obs/turn changed"),
+    "two observations": (both_of, "obs/place and obs/turn changed"),
     "a label": (lambda file: file["data/demo_4/labels/phase"].__setitem__(0, 5), "labels/phase changed"),
     "the mask": (lambda file: instead(file, "mask/valid", [b"demo_7"]), "mask/valid changed"),
     "no mask": (lambda file: file.__delitem__("mask/valid"), "mask/valid changed"),
     "one more": (lambda file: file.copy("data/demo_4", file["data"], "demo_99"), "demo_99 is new"),
-    "others": (
-        lambda file: [file.move(f"data/demo_{n}", f"data/new_{n}") for n in (4, 5)],
-        "demo_4 and 1 more are missing and new_4 and 1 more are new",
-    ),
+    "others": (renamed, "demo_4 and 1 more are missing and new_4 and 1 more are new"),
 }
 """What of a file changes, and how that is said."""
 
@@ -180,9 +182,7 @@ def test_the_digest_sees_every_number() -> None:
     assert difference(digest(first), digest(backwards)) == "their order differs"
 
 
-def test_pictures_are_read_once_and_again_where_their_file_has_changed(
-    few_dots: Path, tmp_path: Path, monkeypatch
-):
+def test_pictures_are_read_once_and_again_where_their_file_changed(few_dots: Path, tmp_path, monkeypatch):
     """What is in the file decides, not when it was written: a copy is the same, an edit is not."""
     read = []
     monkeypatch.setattr(fitted_to, "blocks", lambda array: read.append(array) or [np.asarray(array)])

@@ -1,4 +1,4 @@
-"""Draws of options against sums over every path, the posterior marginals, and exact distributions of boundaries."""
+"""Draws of options against sums over every path, the posterior marginals, and exact boundaries."""
 
 import itertools
 from collections import Counter
@@ -22,32 +22,25 @@ LENGTHS = (4, 2, 3)
 
 
 def drawn(hierarchy, demos, draws, seed=0, chains=1) -> Draws:
-    names = {
-        f"level-{d}": ("control", *"abcdefg"[: level.count]) for d, level in enumerate(hierarchy.levels, 1)
-    }
+    levels = enumerate(hierarchy.levels, 1)
+    names = {f"level-{d}": ("control", *"abcdefg"[: level.count]) for d, level in levels}
     models = [infer(hierarchy, demos) for _ in range(chains)]
     return draw(models, names, list(range(chains)), draws, seed)
 
 
 @pytest.mark.parametrize(("counts", "steps"), [((3,), 4), ((2, 1), 3), ((1, 2, 1), 2)])
 def test_draws_have_the_probabilities_of_the_paths(counts, steps) -> None:
-    """Whole paths of all levels, and u, v and w, by chi-square with the expected counts of a sum over every path."""
-    hierarchy, demos, draws = (
-        make_hierarchy(counts, ("options", "control")),
-        of_states((steps, steps - 1)),
-        3000,
-    )
+    """Whole paths of all levels, and u, v and w, by chi-square with the counts of a sum over every path."""
+    hierarchy, draws = make_hierarchy(counts, ("options", "control")), 3000
+    demos = of_states((steps, steps - 1))
     found = drawn(hierarchy, demos, draws)
     (piece,) = infer(hierarchy, demos)
     assert found.log_likelihood == pytest.approx(piece.log_likelihood[None])
     for n, length in ((0, steps), (1, steps - 1)):
-        options, starts = (
-            np.stack([level[0, :, n, :length] for level in kind.values()], -1)
-            for kind in (found.options, found.starts)
-        )
-        seen = Counter(
-            (tuple(map(tuple, h)), tuple(map(tuple, b))) for h, b in zip(options, starts, strict=True)
-        )
+        kinds = [found.options.values(), found.starts.values()]
+        options, starts = (np.stack([level[0, :, n, :length] for level in kind], -1) for kind in kinds)
+        pairs = zip(options, starts, strict=True)
+        seen = Counter((tuple(map(tuple, h)), tuple(map(tuple, b))) for h, b in pairs)
         sizes = [1 + count for count in counts]
         exact = {(h, b): p for h, b, p in paths(piece.tables, n, length, sizes) if p > 0}
         total = sum(exact.values())
@@ -102,9 +95,8 @@ def test_a_model_with_other_numbers_is_numbered_like_the_first() -> None:
     pieces = [next(iter(infer(model, demos))) for model in (hierarchy, other)]
     assert pieces[1].log_likelihood == pytest.approx(pieces[0].log_likelihood)  # the same model
     u = pieces[0].posterior.u[0]
-    torch.testing.assert_close(
-        pieces[1].posterior.u[0][..., 1:], u[..., [1 + own for own in order]], atol=1e-5, rtol=0
-    )
+    other, ordered = pieces[1].posterior.u[0][..., 1:], u[..., [1 + own for own in order]]
+    torch.testing.assert_close(other, ordered, atol=1e-5, rtol=0)
     names = {"level-1": ("control", "a", "b", "c")}
     found = draw([[piece] for piece in pieces], names, [0, 7], 400, 0)
     assert found.seeds == (0, 7)
@@ -116,14 +108,12 @@ def test_a_model_with_other_numbers_is_numbered_like_the_first() -> None:
 
 def test_options_are_matched_as_well_as_can_be() -> None:
     random = np.random.default_rng(0)
-    ours, theirs = (
-        [torch.from_numpy(random.dirichlet(np.ones(5), size=30)) for _ in range(2)] for _ in range(2)
-    )
+    parts = [torch.from_numpy(random.dirichlet(np.ones(5), size=30)) for _ in range(4)]
+    ours, theirs = parts[:2], parts[2:]
     (order,) = matched(ours, theirs, [5])
     both = (torch.cat(ours).T @ torch.cat(theirs)).numpy()
-    best = max(
-        itertools.permutations(range(1, 5)), key=lambda each: sum(both[a, b] for b, a in enumerate(each, 1))
-    )
+    orders = itertools.permutations(range(1, 5))
+    best = max(orders, key=lambda each: sum(both[a, b] for b, a in enumerate(each, 1)))
     assert order.tolist() == [0, *best]
 
 
@@ -139,22 +129,15 @@ def test_the_interval_holds_the_exact_mass_of_one_switch() -> None:
     evidence = np.array([2.0, 1.5, 1.0, 0.4, 0.1, -0.3, -1.0, -1.6, -2.0]) / 2
     control = torch.from_numpy(np.stack([evidence, -evidence], -1)[None])
     tables = Tables((selection.double(),), (ending,), (control, torch.full((1, steps, 1), NEVER).double()))
-    exact = np.array(
-        [
-            0.2 * 0.8 ** (t - 1) * np.exp(evidence[:t].sum() - evidence[t:].sum()) if t else 0.0
-            for t in range(steps)
-        ]
-    )
+    gains = [np.exp(evidence[:t].sum() - evidence[t:].sum()) for t in range(steps)]
+    exact = np.array([0.2 * 0.8 ** (t - 1) * gain if t else 0.0 for t, gain in enumerate(gains)])
     stays = 0.8 ** (steps - 1) * np.exp(evidence.sum())
     total = exact.sum() + stays
     exact /= exact.sum()
-    options, starts = (
-        kind[0][:, :, None].numpy()[None][:, :, 0]
-        for kind in sample_paths(tables, torch.tensor([steps]), 20_000)
-    )
-    draws = Draws(
-        {"option": options}, {"option": starts == 1}, np.zeros((1, 1)), ("demo_0",), {"option": "cab"}, (0,)
-    )
+    path = sample_paths(tables, torch.tensor([steps]), 20_000)
+    options, starts = (kind[0][:, :, None].numpy()[None][:, :, 0] for kind in path)
+    known = (np.zeros((1, 1)), ("demo_0",), {"option": "cab"}, (0,))
+    draws = Draws({"option": options}, {"option": starts == 1}, *known)
     step = int(exact.argmax())
     path = np.where(np.arange(steps) < step, 1, 2)
     (found,) = draws.boundaries("option", 0, path)
@@ -179,9 +162,8 @@ def test_a_boundary_is_looked_for_between_its_neighbours_and_with_its_options() 
     options = np.array(each, dtype=np.int8)[None, :, None]
     options = np.concatenate([options, np.full((1, 4, 1, 2), -1, np.int8)], -1)
     starts = np.diff(options, prepend=-1) != 0
-    draws = Draws(
-        {"option": options}, {"option": starts}, np.zeros((1, 1)), ("demo_0",), {"option": "cab"}, (0,)
-    )
+    known = (np.zeros((1, 1)), ("demo_0",), {"option": "cab"}, (0,))
+    draws = Draws({"option": options}, {"option": starts}, *known)
     path = np.array([1, 1, 1, 2, 2, 2, 2, 1, -1, -1])
     assert draws.boundaries("option", 0, path, mass=1.0) == [Boundary(3, 2, 3, 0.5), Boundary(7, 6, 7, 0.75)]
     again = np.array([1, 0, 1, 0, 0, 0, 0, 0, 0, 0], dtype=bool)

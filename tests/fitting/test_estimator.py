@@ -1,4 +1,4 @@
-"""The estimator: the numbers of ``ddco_pyro.fit``, the conventions of scikit-learn, and the model of hmmlearn."""
+"""The estimator: the numbers of ``ddco_pyro.fit``, scikit-learn's conventions, and the model of hmmlearn."""
 
 from __future__ import annotations
 
@@ -31,10 +31,8 @@ def hidden_markov_model() -> GaussianHMM:
     model = GaussianHMM(3, "diag")
     model.startprob_, ending = np.array([0.5, 0.3, 0.2]), np.array([[0.1], [0.2], [0.15]])
     model.transmat_ = np.diag(1 - ending[:, 0]) + ending * model.startprob_
-    model.means_, model.covars_ = (
-        np.array([[0, 0], [3, 1], [-2, 4.0]]),
-        np.array([[0.5, 0.2], [0.3, 0.4], [0.6, 0.6]]),
-    )
+    model.means_ = np.array([[0, 0], [3, 1], [-2, 4.0]])
+    model.covars_ = np.array([[0.5, 0.2], [0.3, 0.4], [0.6, 0.6]])
     return model
 
 
@@ -48,12 +46,9 @@ def fitted() -> OptionSegmenter:
 
 def test_it_is_the_fit_of_its_spec(fitted: OptionSegmenter) -> None:
     X, U = two_options()
-    demos = ddco_pyro.Demonstrations(
-        tuple(
-            ddco_pyro.Demonstration(f"sequence_{n}", {"x": x}, u)
-            for n, (x, u) in enumerate(zip(X, U, strict=True))
-        )
-    )
+    pairs = enumerate(zip(X, U, strict=True))
+    each = (ddco_pyro.Demonstration(f"sequence_{n}", {"x": x}, u) for n, (x, u) in pairs)
+    demos = ddco_pyro.Demonstrations(tuple(each))
     fit = ddco_pyro.fit(fitted.spec_, demos)
     assert fitted.spec_.seed == 3
     assert fitted.score(X, U) == fit.log_likelihood(demos).sum()
@@ -93,12 +88,15 @@ def test_perceptrons_and_other_settings() -> None:
     X, U = two_options()
     settings = {**QUICK, "hierarchy.levels.0.policy.hidden": [4], "compare_with": ["mixture"]}
     settings |= {"demonstrations.valid_fraction": 0.2}
-    model = OptionSegmenter(2, policy="mlp", differences=False, random_state=None, settings=settings).fit(
-        X, U
-    )
+    own = {"policy": "mlp", "differences": False, "random_state": None, "settings": settings}
+    model = OptionSegmenter(2, **own).fit(X, U)
     assert model.fit_.spec.hierarchy.levels[0].policy.hidden == (4,)
     assert set(model.fit_.baselines) == {"mixture"}
     assert model.fit_.metrics.demonstrations.valid == 1
+
+
+def of_no_state(model: Any, X: Any, U: Any) -> None:
+    model.set_params(random_state="x").fit(X, U)
 
 
 @pytest.mark.parametrize(
@@ -109,10 +107,7 @@ def test_perceptrons_and_other_settings() -> None:
         (lambda model, X, U: model.predict(X, U, [16] * 5), "leave lengths out"),
         (lambda model, X, U: model.set_params(settings={"training.epoch": 3}).fit(X, U), "training.epochs"),
         (lambda model, X, U: model.set_params(n_options=2.5).fit(X, U), "^n_options: must be a whole number"),
-        (
-            lambda model, X, U: model.set_params(random_state="x").fit(X, U),
-            "^random_state='x': has to be a whole",
-        ),
+        (of_no_state, "^random_state='x': has to be a whole"),
         (lambda model, X, U: model.predict([np.hstack([x, x]) for x in X], U), "X has 4 features, but"),
         (lambda model, X, U: model.score(X, [np.hstack([u, u]) for u in U]), r"actions has shape \(4,\)"),
         (lambda model, X, U: model.predict_proba(X, [np.nan * u for u in U]), "U contains NaN"),
@@ -172,7 +167,7 @@ def test_the_columns_of_a_frame_have_to_be_those_of_the_fit() -> None:
 
 
 def test_without_controls_it_is_a_hidden_markov_model() -> None:
-    """hmmlearn with the fitted parameters gives the same likelihood, posterior and decoded log-probability."""
+    """hmmlearn with the fitted parameters gives the same likelihood, posterior and decoded probability."""
     lengths = [150, 90, 60]
     X = np.concatenate([hidden_markov_model().sample(n, random_state=n)[0] for n in lengths])
     ours = OptionSegmenter(3, control="gaussian").fit(X, lengths)
@@ -220,7 +215,7 @@ def test_sequences_are_the_samples_of_model_selection() -> None:
 
 
 class RowsAlone(OptionSegmenter):
-    """Without controls; scikit-learn's checks pass labels of rows as the second argument, which this ignores."""
+    """Without controls; scikit-learn's checks pass labels of rows as the second argument, ignored here."""
 
     def fit(self, X: Any, y: Any = None) -> RowsAlone:
         super().fit(X)

@@ -1,4 +1,4 @@
-"""The library calls: the same fit as the command's, in memory or in a folder; what is read, and in which pieces."""
+"""The library calls: the command's fit, in memory or in a folder; what is read, and in which pieces."""
 
 import json
 import math
@@ -44,21 +44,17 @@ READ = "log_likelihood", "segment", "draws"
 """Methods of a fit that take demonstrations."""
 
 
-def one(
-    place: object = np.ones((8, 2)), actions: object = np.ones((8, 2)), **observations: object
-) -> Demonstration:
-    return Demonstration("demo", {"place": place, "turn": np.ones((8, 1)), **observations}, actions)
+def one(place: object = np.ones((8, 2)), actions: object = np.ones((8, 2)), **more: object) -> Demonstration:
+    return Demonstration("demo", {"place": place, "turn": np.ones((8, 1)), **more}, actions)
 
 
+MISSPELT = Demonstration("demo", {"plce": np.ones((8, 2))}, np.ones((8, 2)))
 NOT_READ = {
-    "a control too many": (
-        lambda: [one(actions=np.ones((8, 3)))],
-        r"demo: actions has shape \(3,\) at each step,",
-    ),
+    "a control too many": (lambda: [one(actions=np.ones((8, 3)))], r"demo: actions has shape \(3,\) at each"),
     "a wide observation": (lambda: [one(np.ones((8, 3)))], r"demo: obs/place has shape \(3,\)"),
     "a missing observation": (
-        lambda: [Demonstration("demo", {"plce": np.ones((8, 2))}, np.ones((8, 2)))],
-        r"demo: there is no observation 'place' \(did you mean 'plce'\?\)",
+        lambda: [MISSPELT],
+        r"demo: there is no observation 'place' \(did you mean 'pl",
     ),
     "a huge number": (lambda: [one(np.full((8, 2), 1e20))], "demo: obs/place at step 0 is 1e"),
     "a name twice": (lambda: [one(), one()], "demo: there are two demonstrations of this name"),
@@ -97,9 +93,7 @@ UNAPPLIED = {
 
 
 @pytest.mark.parametrize("fault", [*UNSEEN, *(f"control: {name}" for name in UNAPPLIED)])
-def test_what_cannot_be_acted_on_is_refused_in_a_line_and_changes_nothing(
-    fault: str, in_memory: ddco_pyro.Fit
-) -> None:
+def test_what_cannot_be_acted_on_is_refused_and_changes_nothing(fault: str, in_memory: ddco_pyro.Fit) -> None:
     of_control, applied = fault.startswith("control: "), np.zeros(2)
     wrong, says = UNAPPLIED[fault.removeprefix("control: ")] if of_control else UNSEEN[fault]
     monitor, controller, found = in_memory.monitor(), in_memory.controller(), []
@@ -118,30 +112,24 @@ def test_what_cannot_be_acted_on_is_refused_in_a_line_and_changes_nothing(
     assert found[0] == found[1]
 
 
+WAYS, FILES = "control='average': has to be one of mean,", "demonstrations: has to be the path .*; got Dem"
+
+
 @pytest.mark.parametrize(
     ("ask", "says"),
     [
         (lambda fit: fit.controller(-1), "seed=-1: has to be a whole number from 0 on"),
         (lambda fit: ddco_pyro.Controller(fit), "a Fit in place of networks: give fit.hierarchy"),
-        (
-            lambda fit: ddco_pyro.Controller(fit.hierarchy, "average"),
-            "control='average': has to be one of mean,",
-        ),
+        (lambda fit: ddco_pyro.Controller(fit.hierarchy, "average"), WAYS),
         (lambda fit: fit.draws(two_skills(), 0), "draws=0: has to be a whole number from 1 on"),
-        (
-            lambda fit: fit.draws(two_skills(), 2).boundaries("skill", 0, np.ones(8)),
-            "there is no level 'skill'",
-        ),
+        (lambda fit: fit.draws(two_skills(), 2).boundaries("skill", 0, np.ones(8)), "no level 'skill'"),
         (lambda fit: fit.monitor().step(SEEN, np.zeros(2)), "no control comes before the first observation"),
         (lambda fit: ddco_pyro.fit(fit.spec, np.ones((8, 2))), "got ndarray"),
         (
             lambda fit: ddco_pyro.fit({"observations": []}, two_skills()),
-            "spec: has to be the path .*; got dict",
+            "spec: has to be the path .*; got di",
         ),
-        (
-            lambda fit: ddco_pyro.segment(fit, two_skills()),
-            "demonstrations: has to be the path .*; got Demonstrations",
-        ),
+        (lambda fit: ddco_pyro.segment(fit, two_skills()), FILES),
         (lambda fit: Demonstration("a", np.ones(3), np.ones((3, 1))), "observations have to be a mapping"),
         (lambda fit: Demonstration("a", {"x": [[1], [1, 2]]}, np.ones((2, 1))), "a: obs/x is no array"),
         (lambda fit: two_skills().split(1.5, 0), "valid_fraction=1.5"),
@@ -160,11 +148,11 @@ def test_wrong_arguments_are_refused_in_a_line(ask, says: str, in_memory: ddco_p
 def test_what_is_printed_is_a_few_lines(in_memory: ddco_pyro.Fit) -> None:
     demos = replace(two_skills(), masks={"valid": ("demo_3",)})
     values, counts = in_memory.metrics.log_likelihood_per_step, in_memory.metrics.demonstrations
+    trained = f"{values.train:.3f} ({counts.train} trained with)"
     assert str(in_memory).splitlines() == [
         "ddco",
         "  option: option 1, option 2",
-        f"  log-likelihood, nats per step: {values.train:.3f} ({counts.train} trained with), {values.valid:.3f} "
-        f"({counts.valid} held out)",
+        f"  log-likelihood, nats per step: {trained}, {values.valid:.3f} ({counts.valid} held out)",
     ]
     arrays = ["  actions [2] float64", "  obs/place [2] float64", "  obs/turn [1] float64"]
     assert repr(demos[1]).splitlines() == ["demo_1: 9 steps", *arrays]
@@ -175,20 +163,16 @@ def test_segments_are_a_table_of_the_most_likely_path(in_memory: ddco_pyro.Fit) 
     demos = two_skills()
     (options,) = in_memory.segment(demos)
     assert list(map(len, options)) == list(demos.lengths)
-    assert (options.level, options.names, options.demonstrations) == (
-        "option",
-        in_memory.names["option"],
-        demos.names,
-    )
+    about = ("option", in_memory.names["option"], demos.names)
+    assert (options.level, options.names, options.demonstrations) == about
     rows = options.segments
     for demo, path in zip(demos, options, strict=True):
         own = [row for row in rows if row.demonstration == demo.name]
         assert [row.option for row in own for _ in range(row.steps)] == path.tolist()
         assert [row.start for row in own] == [0, *np.cumsum([row.steps for row in own])[:-1]]
         assert all(row.name == options.names[row.option] for row in own)
-    assert str(options).startswith(
-        f"option: 12 demonstrations, {len(rows)} segments\n  demo_0: {rows[0].name} ("
-    )
+    first = f"option: 12 demonstrations, {len(rows)} segments\n  demo_0: {rows[0].name} ("
+    assert str(options).startswith(first)
     table = pytest.importorskip("pandas").DataFrame(rows)
     assert [*table.columns] == ["demonstration", "level", "option", "name", "start", "steps"]
 
@@ -226,18 +210,16 @@ def test_what_needs_a_folder_says_so(in_memory: ddco_pyro.Fit) -> None:
 def test_demonstrations_from_memory_are_kept_with_the_run(commanded: Path, tmp_path: Path) -> None:
     spec, folder = load_spec(commanded / "spec.yaml"), tmp_path / "run"
     fit = ddco_pyro.fit(spec, two_skills(), out=folder)
-    assert (folder / "model.safetensors").read_bytes() == (
-        commanded / "run" / "model.safetensors"
-    ).read_bytes()
+    ours, theirs = ((each / "model.safetensors").read_bytes() for each in (folder, commanded / "run"))
+    assert ours == theirs
     assert numbers(ddco_pyro.load(folder)) == numbers(fit)
     done("report", folder)
     done("compare", folder, commanded / "run", "--out", tmp_path / "compared")
     before = (folder / "metrics.json").read_bytes()
     assert ddco_pyro.fit(spec, two_skills(), out=folder).metrics == fit.metrics
     assert (folder / "metrics.json").read_bytes() == before
-    with pytest.raises(
-        BadInput, match=r"run: is a run of other demonstrations \(actions and obs/place changed\)"
-    ):
+    says = r"run: is a run of other demonstrations \(actions and obs/place changed\)"
+    with pytest.raises(BadInput, match=says):
         ddco_pyro.fit(spec, two_skills(seed=1), out=folder)
 
 
@@ -249,37 +231,31 @@ def test_demonstrations_in_another_order_are_the_same(in_memory: ddco_pyro.Fit, 
     assert numbers(ddco_pyro.fit(in_memory.spec, backwards, out=tmp_path / "run")) == numbers(fit)
 
 
-def test_masks_of_demonstrations_from_memory_say_which_are_held_out(
-    in_memory: ddco_pyro.Fit, tmp_path: Path
-) -> None:
+def test_masks_of_demonstrations_from_memory_say_which_are_held_out(in_memory, tmp_path: Path) -> None:
     """In whatever order they come, with a run that keeps them or without."""
     names = two_skills().names
     given = replace(two_skills(), demonstrations=tuple(reversed(two_skills())), masks={"valid": names[2:5]})
     kept = ddco_pyro.fit(in_memory.spec, given, out=tmp_path / "run")
     for fit in (kept, ddco_pyro.fit(in_memory.spec, given)):
         assert tuple(one.name for one in fit.metrics.valid) == names[2:5]
-    assert Demonstrations.read(tmp_path / "run" / "demonstrations.hdf5", ["place"]).masks == {
-        "valid": names[2:5]
-    }
+    kept = Demonstrations.read(tmp_path / "run" / "demonstrations.hdf5", ["place"])
+    assert kept.masks == {"valid": names[2:5]}
 
 
 def test_the_spec_says_what_is_seen_of_demonstrations_from_memory(in_memory: ddco_pyro.Fit) -> None:
     """Another observation, and a demonstration that is left out."""
     records = [*two_skills(), Demonstration("other", two_skills()[0].observations, two_skills()[0].actions)]
-    more = [
-        Demonstration(d.name, {**d.observations, "noise": np.ones((len(d), 3))}, d.actions) for d in records
-    ]
+    noisy = [{**d.observations, "noise": np.ones((len(d), 3))} for d in records]
+    more = [Demonstration(d.name, own, d.actions) for d, own in zip(records, noisy, strict=True)]
     spec = with_overrides(in_memory.spec, {"demonstrations.exclude": ["other"]})
     fit = ddco_pyro.fit(spec, Demonstrations(tuple(more)))
     assert numbers(fit) == numbers(in_memory)
     assert numbers(ddco_pyro.fit(in_memory.spec, Demonstrations(tuple(more[:-1])))) == numbers(in_memory)
+    other = with_overrides(spec, {"demonstrations.exclude": ["another"]})
     with pytest.raises(DemonstrationsError, match=r"there is no demonstration 'another'"):
-        ddco_pyro.fit(
-            with_overrides(spec, {"demonstrations.exclude": ["another"]}), Demonstrations(tuple(more))
-        )
-    with pytest.raises(
-        DemonstrationsError, match=r"there is no obs/plac .did you mean 'place'..; there is: place"
-    ):
+        ddco_pyro.fit(other, Demonstrations(tuple(more)))
+    says = r"there is no obs/plac .did you mean 'place'..; there is: place"
+    with pytest.raises(DemonstrationsError, match=says):
         ddco_pyro.fit(with_overrides(in_memory.spec, {"observations": ["plac"]}), two_skills())
     with pytest.raises(DemonstrationsError, match=r"there is no labels/phase; there is: nothing"):
         ddco_pyro.fit(with_overrides(in_memory.spec, {"demonstrations.labels": "phase"}), two_skills())
@@ -327,9 +303,8 @@ def test_the_best_model_is_exported(commanded: Path, tmp_path: Path) -> None:
     finally:
         run.metrics.write(commanded / "run")
     done("export", commanded / "run", "--out", tmp_path / "own")
-    names = [
-        json.loads((tmp_path / name / "controller.json").read_text())["names"] for name in ("own", "best")
-    ]
+    files = [tmp_path / name / "controller.json" for name in ("own", "best")]
+    names = [json.loads(file.read_text())["names"] for file in files]
     assert [sorted(each) for each in names] == [["option"], []]  # a flat policy has no options
 
 

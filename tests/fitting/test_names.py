@@ -33,13 +33,10 @@ def labelled(phases=PHASES, number=4, names=None):
     random = np.random.default_rng(0)
     places = [random.normal(size=(len(phases), 2)) for _ in range(number)]
     gains = np.array([[-3.0], [0.5], [3.0]])[np.maximum(phases, 0)]
-    demos = tuple(
-        Demonstration(f"demo_{n}", {"place": place}, gains * place, {"phase": phases})
-        for n, place in enumerate(places)
-    )
-    return Demonstrations(
-        demos, attributes={} if names is None else {"label_names": json.dumps({"phase": names})}
-    )
+    each = enumerate(places)
+    demos = tuple(Demonstration(f"demo_{n}", {"place": p}, gains * p, {"phase": phases}) for n, p in each)
+    attributes = {} if names is None else {"label_names": json.dumps({"phase": names})}
+    return Demonstrations(demos, attributes=attributes)
 
 
 def stands_for(choices, demos):
@@ -129,11 +126,9 @@ def test_names_are_shown_wherever_options_are(files):
     assert [row["skill_name"] for row in rows] == truth
     assert all(fit.names["skill"][int(row["skill"])] == row["skill_name"] for row in rows)
     (row,) = (row for row in use_table(fit).rows if str(row[1]) == "pick & place (option 2)")
-    (instances,) = re.findall(
-        r"pick &amp; place \(option 2\).*?Segments</dt><dd>(\d+)",
-        (run / "report.html").read_text(),
-        re.DOTALL,
-    )
+    text = (run / "report.html").read_text()
+    number = r"pick &amp; place \(option 2\).*?Segments</dt><dd>(\d+)"
+    (instances,) = re.findall(number, text, re.DOTALL)
     assert row[3:] == [instances, "4 steps", "grasp 1.00"]
     with h5py.File(demos) as file:
         place = file["data/demo_0/obs/place"][0]

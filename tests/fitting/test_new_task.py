@@ -1,4 +1,4 @@
-"""A new task from one demonstration and a library: the command, the strength that tasks choose, and what is refused."""
+"""A new task from one demonstration and a library: the command, the strength, and what is refused."""
 
 import json
 from dataclasses import replace
@@ -63,10 +63,9 @@ def test_controls_are_expected_by_the_belief_of_a_monitor(library):
 
 
 def test_one_demonstration_and_a_library_are_enough(library, tmp_path):
-    """The strength is chosen once, is kept with the library and said; the model is that of the library, adapted."""
-    ended = done(
-        "fit", library / "new.yaml", "--library", library / "run", "--out", tmp_path / "run", "--jobs", 1
-    )
+    """The strength is chosen once, is kept with the library and said; the model is the library's, adapted."""
+    places = ("--library", library / "run", "--out", tmp_path / "run")
+    ended = done("fit", library / "new.yaml", *places, "--jobs", 1)
     kept = json.loads((library / "run" / "library.json").read_text())
     assert kept["ridge"] in STRENGTHS
     assert kept["ridge"] == STRENGTHS[int(np.argmin([*kept["error"].values()]))]
@@ -97,11 +96,9 @@ def test_baselines_are_drawn_towards_their_own_models(library, tmp_path, monkeyp
         return begun(self, model)
 
     monkeypatch.setattr(prior.Prior, "log_density", watched)
-    (library / "several.yaml").write_text(
-        yaml.safe_dump(
-            {"demonstrations": {"path": "none.hdf5", "valid_fraction": 0.3}, "compare_with": ["mixture"]}
-        )
-    )
+    demonstrations = {"path": "none.hdf5", "valid_fraction": 0.3}
+    text = yaml.safe_dump({"demonstrations": demonstrations, "compare_with": ["mixture"]})
+    (library / "several.yaml").write_text(text)
     from ddco_pyro.fitting.library import for_new_task
 
     spec = for_new_task(library / "several.yaml", library / "run", ["training.library.ridge=30"])
@@ -110,19 +107,18 @@ def test_baselines_are_drawn_towards_their_own_models(library, tmp_path, monkeyp
     ours = ddco_pyro.load(library / "run").baselines["mixture"].hierarchy.meta_policy.network.layers[0].weight
     found = fitted.baselines["mixture"].hierarchy.meta_policy.network.layers[0].weight
     assert float((found - ours).detach().abs().max()) < 1.0
-    assert not fitted.metrics.training.restarts.each[
-        1:
-    ]  # no restart goes on from the mixture, which has its own prior
+    # no restart goes on from the mixture, which has its own prior
+    assert not fitted.metrics.training.restarts.each[1:]
+
+
+OTHER = "has no model with this hierarchy; take observations, control and networks"
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"training.library.run": "no/run"}, "no/run: not a run folder"),
-        (
-            {"hierarchy.levels.0.count": 4},
-            "has no model with this hierarchy; take observations, control and networks",
-        ),
+        ({"hierarchy.levels.0.count": 4}, OTHER),
         ({"training.library.ridge": -1}, "training.library.ridge: must be at least 0"),
         ({"training.library.strength": 3}, "training.library.strength: unknown key"),
         ({"demonstrations.path": "{folder}/wide.hdf5"}, "actions: has shape 3 at each step, and in"),
@@ -133,18 +129,8 @@ def test_what_cannot_begin_with_a_library_is_refused_in_one_line(library, tmp_pa
     Demonstrations(tuple(wide)).write(library / "wide.hdf5")
     settings = [f"--set={key}={value}".replace("{folder}", str(library)) for key, value in changes.items()]
     out = tmp_path / "run"
-    refused(
-        message,
-        "fit",
-        library / "new.yaml",
-        "--library",
-        library / "run",
-        "--out",
-        out,
-        "--jobs",
-        1,
-        *settings,
-    )
+    places = ("--library", library / "run", "--out", out)
+    refused(message, "fit", library / "new.yaml", *places, "--jobs", 1, *settings)
     assert not out.exists()
 
 
@@ -153,15 +139,6 @@ def test_a_library_of_one_task_says_that_a_strength_is_needed(tmp_path):
     new = tmp_path / "new.yaml"
     Demonstrations(tuple(task(1, 1))).write(tmp_path / "new.hdf5")
     new.write_text(yaml.safe_dump({"demonstrations": {"path": str(tmp_path / "new.hdf5")}}))
-    refused(
-        "training.library.ridge=30",
-        "fit",
-        new,
-        "--library",
-        tmp_path / "run",
-        "--out",
-        tmp_path / "new",
-        "--jobs",
-        1,
-    )
+    places = ("--library", tmp_path / "run", "--out", tmp_path / "new")
+    refused("training.library.ridge=30", "fit", new, *places, "--jobs", 1)
     assert not (tmp_path / "new").exists()

@@ -1,4 +1,4 @@
-"""Episodes as recorded against the environment's own arithmetic; intervals and tests against their closed forms."""
+"""Episodes as recorded against the environment's own arithmetic; intervals and tests against closed forms."""
 
 import math
 from dataclasses import replace
@@ -132,9 +132,10 @@ def test_a_rate_has_its_wilson_interval(successes, trials):
     np.testing.assert_allclose(found.interval, [expected.low, expected.high], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("only_ours", "only_theirs", "both"), [(0, 0, 5), (6, 1, 3), (1, 6, 3), (4, 4, 0), (12, 0, 0)]
-)
+PAIRS = [(0, 0, 5), (6, 1, 3), (1, 6, 3), (4, 4, 0), (12, 0, 0)]
+
+
+@pytest.mark.parametrize(("only_ours", "only_theirs", "both"), PAIRS)
 def test_mcnemars_exact_p_value(only_ours, only_theirs, both):
     """Under equal chances the number of wins among the discordant pairs is binomial."""
     ours = [1.0] * only_ours + [0.0] * only_theirs + [1.0] * both + [0.0] * 2
@@ -142,17 +143,13 @@ def test_mcnemars_exact_p_value(only_ours, only_theirs, both):
     discordant = only_ours + only_theirs
     found = paired_difference(ours, theirs)
     assert (found.only_ours, found.only_theirs, found.trials) == (only_ours, only_theirs, len(ours))
-    assert found.p_value == pytest.approx(
-        stats.binomtest(only_ours, discordant).pvalue if discordant else 1.0
-    )
+    expected = stats.binomtest(only_ours, discordant).pvalue if discordant else 1.0
+    assert found.p_value == pytest.approx(expected)
 
 
 def test_a_measure_leaves_out_the_episodes_it_does_not_apply_to():
-    outcomes = [
-        {"success": 1.0, "error": 0.5},
-        {"success": 0.0, "error": math.nan},
-        {"success": 1.0, "error": 1.5},
-    ]
+    errors = {0.5: 1.0, math.nan: 0.0, 1.5: 1.0}
+    outcomes = [{"success": success, "error": error} for error, success in errors.items()]
     found = summarize(task, [*outcomes, {"success": 1.0}])
     assert (found["success"].successes, found["success"].trials) == (3, 4)
     assert (found["error"].mean, found["error"].trials) == (1.0, 2)

@@ -1,4 +1,4 @@
-"""The run folder: what is in it, that its numbers can be computed again from it, and that it comes back bit for bit."""
+"""The run folder: what is in it, that its numbers can be computed from it, and it comes back to a bit."""
 
 import csv
 import json
@@ -59,9 +59,8 @@ def test_the_history_has_every_epoch(toy_run, watched):
     assert [{**row, "restart": str(row["restart"]), "epoch": str(row["epoch"])} for row in told] == [
         {**row, "train": float(row["train"]), "tune": float(row["tune"])} for row in rows
     ]
-    assert [row["stage"] for row in rows] == ["vq-1"] * 6 + ["level-1"] * 6 + ["meta-policy"] * 6 + [
-        "joint"
-    ] * 6
+    stages = ["vq-1"] * 6 + ["level-1"] * 6 + ["meta-policy"] * 6 + ["joint"] * 6
+    assert [row["stage"] for row in rows] == stages
 
 
 # --- the numbers again --------------------------------------------------------------------------------------
@@ -80,14 +79,12 @@ def test_log_likelihoods_can_be_computed_again(toy_run, parts):
 
 def test_baselines_are_trained_on_the_same_split(toy_run):
     metrics = toy_run.metrics
-    assert metrics.demonstrations == Counts(
-        train=8, tune=1, valid=3, supervisor=metrics.demonstrations.supervisor
-    )
+    supervisor = metrics.demonstrations.supervisor
+    assert metrics.demonstrations == Counts(train=8, tune=1, valid=3, supervisor=supervisor)
     for baseline in toy_run.baselines.values():
         for key in ("name", "steps"):
-            assert [getattr(one, key) for one in baseline.metrics.valid] == [
-                getattr(one, key) for one in metrics.valid
-            ]
+            own, ours = ([getattr(one, key) for one in each.valid] for each in (baseline.metrics, metrics))
+            assert own == ours
         assert baseline.metrics.demonstrations == metrics.demonstrations
         for name in ("mean", "std"):
             ours, theirs = (getattr(one.hierarchy.encoder, name) for one in (toy_run, baseline))
@@ -114,9 +111,8 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
     for name in ("model.safetensors", "history.csv", "baselines/flat/model.safetensors", "spec.yaml"):
         assert (folder / name).read_bytes() == (toy_run.folder / name).read_bytes()
     for name in ("metrics.json", "baselines/flat/metrics.json"):
-        ours, theirs = (
-            json.loads((one / name).read_text()) | {"seconds": ...} for one in (folder, toy_run.folder)
-        )
+        texts = [(one / name).read_text() for one in (folder, toy_run.folder)]
+        ours, theirs = (json.loads(text) | {"seconds": ...} for text in texts)
         assert ours == theirs
     assert not list(folder.rglob("*.tmp"))
 
@@ -124,9 +120,8 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(toy_run, toy_spec, tmp_pat
 def test_a_finished_run_is_left_as_it_is(copied, toy_spec):
     metrics = copied / "metrics.json"
     metrics.write_text(json.dumps(json.loads(metrics.read_text()) | {"note": "kept"}))
-    before = {
-        path: (path.read_bytes(), path.stat().st_mtime_ns) for path in copied.rglob("*") if path.is_file()
-    }
+    paths = [path for path in copied.rglob("*") if path.is_file()]
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in paths}
     assert fit(toy_spec, out=copied, on_event=Interrupting(1)).metrics.model_extra == {"note": "kept"}
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in before} == before
 
@@ -142,29 +137,26 @@ def test_claiming_a_folder(tmp_path, toy_spec):
     claim(folder, toy_spec, resume=False)  # killed before its report
     (folder / "report.html").touch()
     claim(folder, toy_spec, resume=True)
-    with pytest.raises(
-        BadInput, match=r"run: holds a run of this spec already; show it with --resume, or choose"
-    ):
+    says = r"run: holds a run of this spec already; show it with --resume, or choose"
+    with pytest.raises(BadInput, match=says):
         claim(folder, toy_spec, resume=False)
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match=r": is not empty and not a run; choose another --out$"):
         claim(tmp_path, toy_spec)
-    with (
-        pytest.raises(BadInput, match=r"file: is a file; choose another --out$"),
-        claimed(tmp_path / "file", toy_spec),
-    ):
+    says = r"file: is a file; choose another --out$"
+    with pytest.raises(BadInput, match=says), claimed(tmp_path / "file", toy_spec):
         pass
+
+
+UNFINISHED = r"run: an unfinished run: fit it again to continue it \(it has no "
 
 
 @pytest.mark.parametrize(
     ("removed", "message"),
     [
         ("spec.yaml", r"run: not a run folder \(it has no spec\.yaml\)$"),
-        (
-            "model.safetensors",
-            r"run: an unfinished run: fit it again to continue it \(it has no model\.safetensors\)$",
-        ),
-        ("metrics.json", r"run: an unfinished run: fit it again to continue it \(it has no metrics\.json\)$"),
+        ("model.safetensors", UNFINISHED + r"model\.safetensors\)$"),
+        ("metrics.json", UNFINISHED + r"metrics\.json\)$"),
     ],
 )
 def test_what_is_not_a_finished_run_is_not_loaded(copied, removed, message):
@@ -175,7 +167,6 @@ def test_what_is_not_a_finished_run_is_not_loaded(copied, removed, message):
 
 def test_a_model_of_another_spec_is_not_loaded(copied, toy_spec):
     (copied / "spec.yaml").write_text(dump_spec(with_overrides(toy_spec, {"hierarchy.levels.0.count": 3})))
-    with pytest.raises(
-        BadInput, match=r"run/model\.safetensors: is of another spec than spec\.yaml; remove it and"
-    ):
+    says = r"run/model\.safetensors: is of another spec than spec\.yaml; remove it and"
+    with pytest.raises(BadInput, match=says):
         ddco_pyro.load(copied)

@@ -23,11 +23,8 @@ SPEC = {
     "task": "toy",
     "demonstrations": {"count": 8},
     "observations": ["offsets", "visited"],
-    "hierarchy": {
-        "levels": [{"count": 2, "policy": {"network": "linear"}}],
-        "meta_policy": {"network": "linear"},
-    },
-    "compare_with": [{"kind": "flat", "policy": {"network": "linear"}}, "mixture"],
+    "hierarchy": {"levels": [{"count": 2, "policy": LINEAR}], "meta_policy": LINEAR},
+    "compare_with": [{"kind": "flat", "policy": LINEAR}, "mixture"],
     "training": {"epochs": 4, "starts": ["random"], "layerwise": False},
 }
 
@@ -51,9 +48,8 @@ def test_each_repetition_is_that_fit_with_another_training_seed(written):
         assert again.baselines[name].metrics.log_likelihood_per_step == (
             alone.baselines[name].metrics.log_likelihood_per_step
         )
-    held_out = [
-        [row.name for row in ddco_pyro.load(path).metrics.valid] for path in (run, run / "seeds" / "1")
-    ]
+    runs = [ddco_pyro.load(path) for path in (run, run / "seeds" / "1")]
+    held_out = [[row.name for row in one.metrics.valid] for one in runs]
     assert held_out[0] == held_out[1]
     found = ddco_pyro.load(run).metrics.seeds
     assert found.training_seeds == [0, 1, 2]
@@ -93,9 +89,8 @@ def test_rollouts_have_the_same_two_parts_and_the_same_seeds(written, tmp_path):
     for folder in (run, run / "seeds" / "1", run / "seeds" / "2"):
         rows = list(csv.DictReader((folder / "rollouts.csv").open()))
         names = ("ddco", "mixture", "flat")
-        succeeded.append(
-            {name: sum(float(row["success"]) for row in rows if row["method"] == name) for name in names}
-        )
+        won = {name: [float(row["success"]) for row in rows if row["method"] == name] for name in names}
+        succeeded.append({name: sum(own) for name, own in won.items()})
     assert found["seeds"]["success"]["mixture"] == [one["mixture"] / 6 for one in succeeded]
     memory = [(one["ddco"] - one["mixture"]) / 6 for one in succeeded]
     experts = [(one["mixture"] - one["flat"]) / 6 for one in succeeded]
@@ -156,14 +151,12 @@ def test_every_demonstration_trains_and_is_held_out_from_a_fit_without_it(run):
     masked, one = replace(demos, masks={"valid": ("demo_0",)}), demos.select(["demo_0"])
     for method, model in (("ddco", run), *run.baselines.items()):
         (held_out,) = (row.log_likelihood for row in model.metrics.valid if row.name == "demo_0")
-        apart = ddco_pyro.fit(
-            with_overrides(model.spec, alone), masked
-        )  # the same held out by a mask instead
+        # the same held out by a mask instead
+        apart = ddco_pyro.fit(with_overrides(model.spec, alone), masked)
         assert held_out == pytest.approx(float(apart.log_likelihood(one)[0])), method
         assert held_out < float(model.log_likelihood(one)[0])  # which the model was fitted to
-    everything = ddco_pyro.fit(
-        with_overrides(run.spec, alone | {"demonstrations.valid_fraction": 0.0}), demos
-    )
+    spec = with_overrides(run.spec, alone | {"demonstrations.valid_fraction": 0.0})
+    everything = ddco_pyro.fit(spec, demos)
     np.testing.assert_array_equal(run.log_likelihood(demos), everything.log_likelihood(demos))
 
 

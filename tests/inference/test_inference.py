@@ -53,9 +53,8 @@ def test_posterior_is_the_marginal_over_paths(counts, hybrid, steps, power):
         truth = brute_force(tables, n, length)
         for name, d in itertools.product("uvw", range(len(counts))):
             table = getattr(found, name)[d][n]
-            np.testing.assert_allclose(
-                table[:length].numpy(), getattr(truth, name)[d], atol=1e-9, err_msg=name
-            )
+            ours, theirs = table[:length].numpy(), getattr(truth, name)[d]
+            np.testing.assert_allclose(ours, theirs, atol=1e-9, err_msg=name)
             assert not table[length:].any()
 
 
@@ -109,9 +108,8 @@ def test_the_belief_is_what_the_past_says(counts, hybrid, steps, power, evident)
     if evident:
         random = torch.Generator().manual_seed(3)
         for level, size in enumerate(tables.sizes, start=1):
-            tables = tables.with_evidence(
-                level, torch.randn(2, steps, size, generator=random, dtype=torch.float64)
-            )
+            evidence = torch.randn(2, steps, size, generator=random, dtype=torch.float64)
+            tables = tables.with_evidence(level, evidence)
     filtering, lengths = Filter(power), torch.tensor([steps, steps])
     density = joint_density(tables.control).unbind(1)
     for t, now in enumerate(complete(tables, lengths).steps()):
@@ -135,9 +133,8 @@ def test_the_predictive_density_is_that_of_every_path_so_far(counts, hybrid, ste
     tables = replace(random_tables(counts, hybrid, trajectories=2, steps=steps, seed=5), power=power)
     lengths = torch.tensor([steps, max(steps - 1, 1)])
     found = log_predictive(tables, lengths)
-    truth = [
-        sum(step.value for step in predictions(tables, n, int(length))) for n, length in enumerate(lengths)
-    ]
+    steps = [predictions(tables, n, int(length)) for n, length in enumerate(lengths)]
+    truth = [sum(step.value for step in own) for own in steps]
     np.testing.assert_allclose(found.numpy(), truth, atol=1e-9)
     if power == 1:
         torch.testing.assert_close(found, log_likelihood(tables, lengths))
@@ -179,24 +176,16 @@ LENGTHS = {
     "mask": (torch.tensor([True, True, True]), "lengths: give a tensor of integers"),
     "list": ([5, 4, 3], "lengths: give a tensor of integers, one for each trajectory; got list"),
 }
+SHORT = r"termination\[1\]: expected floating-point numbers \[3, 5, 2, 2\]; got float64 \[3, 4, 2, 2\]"
+CALLERS = r"selection\[1\]: expected \[N, T, callers, 1 \+ options\]"
+LEVELS = "control: tables with 2 levels of selections need 3; got 0"
+NAN = r"control\[0\]: a log-probability of trajectory 1 at step 3 is NaN or \+inf"
 TABLES = {
-    "short termination": (
-        lambda t: _changed(t, "termination", 1, t.termination[1][:, :4]),
-        r"termination\[1\]: expected floating-point numbers \[3, 5, 2, 2\]; got float64 \[3, 4, 2, 2\]",
-    ),
-    "no callers": (
-        lambda t: _changed(t, "selection", 1, t.selection[1][:, :, 0]),
-        r"selection\[1\]: expected \[N, T, callers, 1 \+ options\]",
-    ),
-    "no control": (
-        lambda t: replace(t, control=()),
-        "control: tables with 2 levels of selections need 3; got 0",
-    ),
+    "short termination": (lambda t: _changed(t, "termination", 1, t.termination[1][:, :4]), SHORT),
+    "no callers": (lambda t: _changed(t, "selection", 1, t.selection[1][:, :, 0]), CALLERS),
+    "no control": (lambda t: replace(t, control=()), LEVELS),
     "evidence of one level": (lambda t: replace(t, evidence=(None,)), r"evidence: .* need 2; got 1"),
-    "NaN": (
-        lambda t: _changed(t, "control", 0, _with(t.control[0], (1, 3, 0), torch.nan)),
-        r"control\[0\]: a log-probability of trajectory 1 at step 3 is NaN or \+inf",
-    ),
+    "NaN": (lambda t: _changed(t, "control", 0, _with(t.control[0], (1, 3, 0), torch.nan)), NAN),
 }
 
 
@@ -270,9 +259,8 @@ def test_the_gradient_of_the_evidence_is_that_of_differences(counts, levels):
             for sign in (1, -1):
                 with torch.no_grad():
                     leaf[place] += sign * step
-                    sides.append(
-                        float(inference.log_likelihood(replace(tables, evidence=evidence), lengths).sum())
-                    )
+                    changed = replace(tables, evidence=evidence)
+                    sides.append(float(inference.log_likelihood(changed, lengths).sum()))
                     leaf[place] -= sign * step
             differences[place] = (sides[0] - sides[1]) / (2 * step)
         for engine in gradients:
@@ -300,12 +288,8 @@ def test_the_eliminated_model_refuses_lengths_and_controls_of_others():
     hierarchy, batch = make_hierarchy((3,)), make_batch()
     with torch.no_grad():
         outputs = hierarchy(batch.inputs)
-    for wrong in (
-        batch.lengths[:1],
-        batch.lengths + 100,
-        batch.lengths - batch.lengths,
-        batch.lengths.double(),
-    ):
+    own = batch.lengths
+    for wrong in (own[:1], own + 100, own - own, own.double()):
         with pytest.raises(BadInput, match="lengths"):
             EliminatedAHMM(outputs, wrong)
     distribution = EliminatedAHMM(outputs, batch.lengths)

@@ -45,11 +45,8 @@ def step(model, elbo, guide_class, seed):
     pyro.set_rng_seed(seed)
     with pyro.poutine.trace(param_only=True) as seen:
         loss = elbo.differentiable_loss(model, guide)
-    leaves = {
-        name: site["value"].unconstrained()
-        for name, site in seen.trace.nodes.items()
-        if site["type"] == "param"
-    }
+    sites = [(name, site) for name, site in seen.trace.nodes.items() if site["type"] == "param"]
+    leaves = {name: site["value"].unconstrained() for name, site in sites}
     return loss.item(), dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
 
 
@@ -79,7 +76,7 @@ def test_nuts_moves_with_weights_in_double_precision():
 
 
 def test_draws_follow_the_model():
-    """Moments of drawn controls against the mixture of every choice's mean, weighted by the run-forward marginals."""
+    """Moments of drawn controls against the mixture of every choice's mean, weighted by forward marginals."""
     torch.manual_seed(0)
     hierarchy, batch = make_hierarchy((3,), ("options", "control")), make_batch()
     with torch.no_grad():
@@ -94,9 +91,8 @@ def test_draws_follow_the_model():
         means = torch.cat([outputs.emissions[1].mean, outputs.emissions[0].mean], dim=2).double()
         expected = (weights.unsqueeze(-1) * means).sum(2)
     for n, length in enumerate(batch.lengths.tolist()):
-        np.testing.assert_allclose(
-            drawn[:, n, :length].mean(0), expected[n, :length], atol=5 * 1.0 / 400**0.5
-        )
+        mean = drawn[:, n, :length].mean(0)
+        np.testing.assert_allclose(mean, expected[n, :length], atol=5 * 1.0 / 400**0.5)
         assert not drawn[:, n, length:].any()
     assert drawn[0].shape == (*distribution.batch_shape, *distribution.event_shape)
 

@@ -1,4 +1,4 @@
-"""Numbers that overflow: refused in a line that names demonstration, key and step, never a likelihood that is none."""
+"""Numbers that overflow: refused in a line that names demonstration, key and step, never a likelihood."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ from ddco_pyro.training.objective import TrainingError
 
 
 def spec_with(folder: Path, place: str, value: float) -> Path:
-    """The spec for demonstrations with one number replaced: ``data/demo_N/KEY`` at step 5, second dimension."""
+    """The spec for demonstrations with one number replaced: ``data/demo_N/KEY`` at step 5, dimension 2."""
     random, path = np.random.default_rng(0), folder / "demos.hdf5"
     with h5py.File(path, "w") as file:
         for number in range(8):
@@ -52,8 +52,8 @@ def test_numbers_that_nothing_can_hold(tmp_path: Path, name: str, key: str, valu
         ended = call(*command)
         assert (ended.status, ended.out) == (2, "")
         assert ended.err == (
-            f"ddco-pyro: {tmp_path / 'demos.hdf5'}: {name}: {key} is {value:g} at step 5, index [1], and at most 1e+30 "
-            f"can be used; repair it, or leave {name} out (demonstrations.exclude)\n"
+            f"ddco-pyro: {tmp_path / 'demos.hdf5'}: {name}: {key} is {value:g} at step 5, index [1], and at "
+            f"most 1e+30 can be used; repair it, or leave {name} out (demonstrations.exclude)\n"
         )
     assert not (tmp_path / "run").exists()
     assert "beyond ±1e+30, the first in" in call("inspect", tmp_path / "demos.hdf5").out
@@ -93,9 +93,8 @@ class Undefined(torch.nn.Module):
 
 def test_networks_that_give_no_numbers_are_named_before_training() -> None:
     spec = small_spec(policy={"network": f"{__name__}:Undefined"})
-    with pytest.raises(
-        TrainingError, match="before any training a network gives values that are NaN or infinite; loo"
-    ):
+    says = "before any training a network gives values that are NaN or infinite; loo"
+    with pytest.raises(TrainingError, match=says):
         fit(spec, of_states([5] * 5))
 
 
@@ -104,7 +103,6 @@ def test_a_likelihood_that_is_none_is_not_reported(tmp_path: Path) -> None:
     found = fit(small_spec(training={"epochs": 1}), demos, out=tmp_path / "run")
     with torch.no_grad():
         next(found.hierarchy.levels[0].policy.parameters())[:] = torch.inf
-    with pytest.raises(
-        Failed, match=r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "
-    ):
+    says = r"run: the log-likelihood of demo_0 under the fitted model is (nan|-inf); "
+    with pytest.raises(Failed, match=says):
         evaluate(found, Mock(), Mock(), {"train": demos}, contained=(), whole=False)

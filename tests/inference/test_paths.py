@@ -1,4 +1,4 @@
-"""Most likely and sampled paths against sums over every path, and against Pyro's own answers on the same model."""
+"""Most likely and sampled paths against sums over every path, and Pyro's own answers on the same model."""
 
 import numpy as np
 import pytest
@@ -45,16 +45,11 @@ def test_of_equally_likely_paths_the_one_that_keeps_the_lowest_choices():
     half = torch.full((1, 4, 1), 0.5).double().log()
     selection = torch.cat([torch.full((1, 4, 1, 1), NEVER), half.unsqueeze(-1), half.unsqueeze(-1)], -1)
     termination = torch.full((1, 4, 2, 2), 0.5).double().log()
-    third = (
-        torch.tensor([1 / 3, 2 / 3]).double().log()
-    )  # keeping is as likely as ending and selecting the same again
-    tables = Tables(
-        (selection,), (third.expand(1, 4, 2, 2),), (torch.zeros(1, 4, 2).double(), half * 0 + NEVER)
-    )
-    assert as_tuples(most_likely_path(tables, torch.tensor([4])), 0, 4) == (
-        ((1,),) * 4,
-        ((1,), (0,), (0,), (0,)),
-    )
+    # keeping is as likely as ending and selecting the same again
+    third = torch.tensor([1 / 3, 2 / 3]).double().log().expand(1, 4, 2, 2)
+    tables = Tables((selection,), (third,), (torch.zeros(1, 4, 2).double(), half * 0 + NEVER))
+    path = as_tuples(most_likely_path(tables, torch.tensor([4])), 0, 4)
+    assert path == (((1,),) * 4, ((1,), (0,), (0,), (0,)))
     never_kept = Tables(tables.selection, (termination * 0 + torch.tensor([NEVER, 0.0]),), tables.control)
     assert as_tuples(most_likely_path(never_kept, torch.tensor([4])), 0, 4) == (((1,),) * 4, ((1,),) * 4)
 

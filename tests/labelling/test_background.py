@@ -1,4 +1,4 @@
-"""A call of the page in another process: how far it is, cancelling it, and processes that are ended from outside."""
+"""A call of the page in another process: how far it is, cancelling it, and processes ended from outside."""
 
 import os
 import signal

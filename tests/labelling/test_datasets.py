@@ -1,4 +1,4 @@
-"""A LeRobot dataset is labelled as it is, and labels are read back by this project's reader and by LeRobot itself."""
+"""A LeRobot dataset is labelled as it is, and labels are read back by this project and by LeRobot itself."""
 
 import json
 import os
@@ -109,7 +109,8 @@ dataset = LeRobotDataset("ddco/labelled", root=sys.argv[1], video_backend="pyav"
 for frame in map(dataset.__getitem__, range(11)):
     rows, now = frame["language_persistent"], float(frame["timestamp"])
     active = active_at(now, persistent=rows, style="subtask", role="assistant")
-    print(json.dumps([active and active["content"], int(frame["subtask_source"]), frame["subtask_annotator"]]))
+    said = [active and active["content"], int(frame["subtask_source"]), frame["subtask_annotator"]]
+    print(json.dumps(said))
 """
 
 

@@ -21,13 +21,8 @@ QUICK = settings(max_examples=25, suppress_health_check=[HealthCheck.function_sc
 def paints(draw):
     name = draw(st.sampled_from([*LENGTHS]))
     start = draw(st.integers(0, LENGTHS[name] - 1))
-    return (
-        "paint",
-        name,
-        start,
-        draw(st.integers(start + 1, LENGTHS[name])),
-        draw(st.sampled_from([OPEN, FREE, 1, 2])),
-    )
+    stop, value = draw(st.integers(start + 1, LENGTHS[name])), draw(st.sampled_from([OPEN, FREE, 1, 2]))
+    return ("paint", name, start, stop, value)
 
 
 name = st.sampled_from([*LENGTHS])
@@ -37,9 +32,8 @@ change = st.one_of(
     st.tuples(st.just("accept"), name, st.booleans(), st.floats(0, 9), st.integers(0, 9)),
     st.tuples(st.just("names"), st.sampled_from([NAMES, ("push", "grasp"), (*NAMES, "lift")])),
 )
-actions = st.lists(
-    st.one_of(st.lists(change, min_size=1, max_size=4), st.sampled_from(["undo", "redo"])), max_size=12
-)
+changes = st.lists(change, min_size=1, max_size=4)
+actions = st.lists(st.one_of(changes, st.sampled_from(["undo", "redo"])), max_size=12)
 
 
 def empty():
@@ -49,12 +43,8 @@ def empty():
 def said(document):
     """What a document says, in plain data."""
     labels = {name: own.tolist() for name, own in document.labels.items()}
-    return (
-        labels,
-        {name: set(own) for name, own in document.cuts.items()},
-        dict(document.accepted),
-        document.names,
-    )
+    cuts = {name: set(own) for name, own in document.cuts.items()}
+    return labels, cuts, dict(document.accepted), document.names
 
 
 def act(labels, action):
@@ -123,9 +113,8 @@ def test_a_journal_torn_at_any_byte_gives_the_state_after_its_whole_lines(tmp_pa
     path.write_bytes(content[:size])
     again = empty()
     journal = Journal(path, again, "option")
-    assert said(again) == next(
-        (states[at] for at in sorted(states, reverse=True) if at <= size), said(empty())
-    )
+    whole = (states[at] for at in sorted(states, reverse=True) if at <= size)
+    assert said(again) == next(whole, said(empty()))
     journal.write([("paint", "demo_1", 0, 3, 1)])  # what follows a torn line is kept whole
     journal.close()
     third = empty()
@@ -134,10 +123,9 @@ def test_a_journal_torn_at_any_byte_gives_the_state_after_its_whole_lines(tmp_pa
 
 
 def recorded(lengths=LENGTHS, control=0.0):
-    each = [
-        (name, {"place": np.zeros((steps, 1))}, np.full((steps, 2), control))
-        for name, steps in lengths.items()
-    ]
+    each = []
+    for name, steps in lengths.items():
+        each.append((name, {"place": np.zeros((steps, 1))}, np.full((steps, 2), control)))
     return Demonstrations([Demonstration(*own) for own in each])
 
 
@@ -156,9 +144,8 @@ def test_edits_of_something_else_are_refused_and_kept(tmp_path, other):
     journal.write([("paint", "demo_0", 0, 6, 1)])
     journal.close()
     content = path.read_bytes()
-    with pytest.raises(
-        BadInput, match="edits of other demonstrations or of another level; give another --out"
-    ):
+    says = "edits of other demonstrations or of another level; give another --out"
+    with pytest.raises(BadInput, match=says):
         Journal(path, empty(), other)
     assert path.read_bytes() == content
     Journal(path, empty(), ours).close()  # and left to others

@@ -7,7 +7,7 @@ from ddco_pyro.labelling.proposals import Shown, excess, expected_wrong, ranking
 
 
 def proposed(generator, steps, sure):
-    """Proposals and true options. A share ``sure`` of the steps is wrong; others are right with probability p."""
+    """Proposals and true options. A share ``sure`` of steps is wrong; others are right with probability p."""
     truth, p = generator.integers(1, 4, steps), generator.beta(8, 1, steps)
     wrong = (generator.random(steps) > p) | (generator.random(steps) < sure)
     return Shown(np.where(wrong, truth % 3 + 1, truth), p), truth
@@ -23,9 +23,8 @@ def test_expected_wrong_steps_are_the_planted_ones_whatever_the_posterior_misses
     assert expected_wrong(shown, free, found) == pytest.approx((shown.options != truth).sum(), rel=0.1)
     half = np.where(np.arange(20_000) < 10_000, truth, -1)
     half[15_000:] = -2  # what is left open is none's fault
-    assert expected_wrong(shown, half, found) == pytest.approx(
-        expected_wrong(shown, free, found) / 4, rel=0.1
-    )
+    quarter = expected_wrong(shown, free, found) / 4
+    assert expected_wrong(shown, half, found) == pytest.approx(quarter, rel=0.1)
 
 
 def test_steps_without_a_name_say_nothing_of_a_proposal():
@@ -36,24 +35,16 @@ def test_steps_without_a_name_say_nothing_of_a_proposal():
 
 def order_of(wrong, edits, centres, accepted=()):
     count = len(wrong)
-    return ranking(
-        np.array(wrong, float),
-        np.array(edits, float),
-        np.array(centres, float),
-        np.isin(np.arange(count), accepted),
-    )
+    given = (np.array(values, float) for values in (wrong, edits, centres))
+    return ranking(*given, np.isin(np.arange(count), accepted))
 
 
 def test_a_long_odd_demonstration_comes_after_usual_ones_with_fewer_wrong_steps():
     wrong, edits = [10, 11, 12, 40], [2, 2, 2, 12]
     centres = [[0.0], [0.1], [0.2], [3.0]]
     assert order_of(wrong, edits, centres)[0] == [2, 1, 0, 3]
-    assert order_of(wrong, [2] * 4, [[0.0]] * 4)[0] == [
-        3,
-        2,
-        1,
-        0,
-    ]  # equally odd and costly: the most wrong steps
+    # equally odd and costly: the most wrong steps
+    assert order_of(wrong, [2] * 4, [[0.0]] * 4)[0] == [3, 2, 1, 0]
     assert order_of([10] * 4, edits, [[0.0]] * 4)[0][-1] == 3  # costly alone
     assert order_of([10] * 4, [2] * 4, centres)[0][-1] == 3  # odd alone
 

@@ -1,4 +1,4 @@
-"""Skills that pictures alone show, planted: what proposals become by features, and where features come from."""
+"""Skills that pictures alone show, planted: what proposals become by features, and where those come from."""
 
 import os
 from dataclasses import replace
@@ -21,7 +21,7 @@ LINEAR = {"network": "linear"}
 
 
 def shown_by_a_lamp(generator, number):
-    """Vectors and controls are noise, and each has another light. A lamp has another colour for each skill."""
+    """Vectors and controls are noise, each in another light. A lamp has another colour for each skill."""
     lengths = generator.integers(8, 20, 6)
     skills = np.cumsum([generator.integers(SKILLS), *generator.integers(1, SKILLS, 5)]) % SKILLS
     phase = np.repeat(skills, lengths)
@@ -60,9 +60,8 @@ def of(lamps, tmp_path, monkeypatch):
     """Features of the file, which this process computes."""
     monkeypatch.setattr(os, "nice", lambda by: 0)
     monkeypatch.setattr(Background, "_submit", here)
-    return lambda backbone: Features.of(
-        lamps[0], tmp_path / "out.hdf5", f"user_encoders:{backbone}", True, {}
-    )
+    out = tmp_path / "out.hdf5"
+    return lambda backbone: Features.of(lamps[0], out, f"user_encoders:{backbone}", True, {})
 
 
 def settled(session):
@@ -96,9 +95,8 @@ def test_features_show_what_vectors_do_not(demos, lamps, of, tmp_path):
 
 def test_features_are_computed_once_and_again_where_a_file_is_damaged(of, demos, monkeypatch):
     before, asked, compute = of("blocks").computed(), [], Backbone.features
-    assert {name: len(rows) for name, rows in before.items()} == dict(
-        zip(demos.names, demos.lengths, strict=True)
-    )
+    lengths = {name: len(rows) for name, rows in before.items()}
+    assert lengths == dict(zip(demos.names, demos.lengths, strict=True))
     assert np.concatenate([*before.values()]).std() == pytest.approx(1.0)
     monkeypatch.setattr(Backbone, "features", lambda own, seen: asked.append(len(seen)) or compute(own, seen))
     again = of("blocks")
@@ -112,15 +110,13 @@ def test_features_are_computed_once_and_again_where_a_file_is_damaged(of, demos,
 
 
 def test_a_network_that_fails_later_is_said_and_labelling_goes_on(lamps, of, tmp_path):
-    session = Session(
-        replace(lamps[1], named={}), lamps[0], tmp_path / "out.hdf5", features=of("later_not_finite")
-    )
+    fit, features = replace(lamps[1], named={}), of("later_not_finite")
+    session = Session(fit, lamps[0], tmp_path / "out.hdf5", features=features)
     session.begin()
     settled(session)
     (line,) = session.state()["warnings"]
-    assert line.startswith(
-        "features of pictures: encoder 'user_encoders:later_not_finite' gives features that are NaN"
-    )
+    says = "features of pictures: encoder 'user_encoders:later_not_finite' gives features that are NaN"
+    assert line.startswith(says)
     assert session.edit({"do": "name", "demo": 0, "step": 0, "option": 1})["done"]
     session.close()
 
@@ -136,16 +132,13 @@ BLOCKS, ALLOWED = "user_encoders:blocks", "--allow-code"
         (["user_encoders:raises", ALLOWED], "fails on pictures [4, 24, 24, 3]: expected 224 x 224"),
     ],
 )
-def test_what_cannot_be_read_is_refused_before_a_page_is_served(
-    lamps, tmp_path, monkeypatch, features, message
-):
+def test_what_cannot_be_read_is_refused_first(lamps, tmp_path, monkeypatch, features, message):
     refused([lamps[1].folder, lamps[0]], features, message, tmp_path, monkeypatch)
 
 
 def test_demonstrations_without_pictures_are_refused(run, file, tmp_path, monkeypatch):
-    refused(
-        [run.folder, file], [BLOCKS, ALLOWED], f"--features: {file} has no pictures", tmp_path, monkeypatch
-    )
+    says = f"--features: {file} has no pictures"
+    refused([run.folder, file], [BLOCKS, ALLOWED], says, tmp_path, monkeypatch)
 
 
 def refused(paths, features, message, folder, monkeypatch):

@@ -174,7 +174,7 @@ window.fetch = async (...asked) => {
   return answer;
 };
 """
-"""Holds answers to what is asked while ``held`` matches it, until they are released, and delays every answer."""
+"""Holds answers to what is asked while ``held`` matches it, until released, and delays all answers."""
 
 SHUFFLED = "let seed = 1; window.wait = () => (seed = seed * 16807 % 2147483647) % 100"
 
@@ -186,9 +186,8 @@ def test_an_answer_that_comes_late_changes_nothing(tabs, session):
         playwright.expect(heading).to_have_text(f"demo_{first}")
         tab.get_by_role("slider", name="Step").focus()
         tab.evaluate(f"window.held = 'view/{first}$'")
-        session.edit(
-            {"do": "split", "demo": (first + 1) % 6, "step": 3}
-        )  # as another tab does; the page asks anew
+        # as another tab does; the page asks anew
+        session.edit({"do": "split", "demo": (first + 1) % 6, "step": 3})
         tab.wait_for_timeout(1500)
         tab.evaluate("window.held = null")
         keys(tab, "2", "Enter")
@@ -257,9 +256,8 @@ def test_the_keyboard_alone_does_everything(tab, session):
     reached = set()
     for _ in range(60):
         keys(tab, "Shift+Tab")
-        reached.add(
-            tab.evaluate("[document.activeElement.ariaLabel, document.activeElement.textContent].join(' ')")
-        )
+        both = "[document.activeElement.ariaLabel, document.activeElement.textContent]"
+        reached.add(tab.evaluate(f"{both}.join(' ')"))
     for name in ("Name of option 2", "Name of a new option", "Demonstrations", "Save", "Step"):
         assert any(name in one for one in reached), f"Tab does not lead to {name}"
     tab.get_by_label("Name of a new option").focus()
@@ -354,9 +352,8 @@ def test_the_page_says_how_far_features_of_pictures_are(tab, session):
 
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_axe_has_no_serious_complaint(browser, session, scheme):
-    axe = pytest.importorskip(
-        "axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed"
-    )
+    why = "axe-playwright-python is not installed"
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason=why)
     context = browser.new_context(color_scheme=scheme, bypass_csp=True)
     with served(session) as address:
         tab = context.new_page()
@@ -364,11 +361,8 @@ def test_axe_has_no_serious_complaint(browser, session, scheme):
 
         def complaints():
             found = axe.Axe().run(tab).response["violations"]
-            return [
-                (one["id"], one["nodes"][0]["html"])
-                for one in found
-                if one["impact"] in ("serious", "critical")
-            ]
+            serious = [one for one in found if one["impact"] in ("serious", "critical")]
+            return [(one["id"], one["nodes"][0]["html"]) for one in serious]
 
         assert complaints() == []
         tab.get_by_role("slider", name="Step").focus()

@@ -1,4 +1,4 @@
-"""The page of ``label`` in a browser, with data of other kinds: pictures, tasks, levels, annotators, and many steps."""
+"""The page of ``label`` in a browser, with other data: pictures, tasks, levels, people, many steps."""
 
 import subprocess
 import sys
@@ -23,9 +23,8 @@ pytestmark = needed
 def test_demonstrations_are_found_by_their_task(tabs, begun, tmp_path):
     path = tmp_path / "demos.hdf5"
     tasks = ("push", "open", "push", "close", "push")
-    demos = (
-        replace(demo, attributes={"task": task}) for demo, task in zip(pick_and_place(5), tasks, strict=True)
-    )
+    pairs = zip(pick_and_place(5), tasks, strict=True)
+    demos = (replace(demo, attributes={"task": task}) for demo, task in pairs)
     Demonstrations(tuple(demos)).write(path)
     with served(begun(path=path)) as address:
         tab = tabs(address)
@@ -145,9 +144,8 @@ FRAMES = """async work => {
 def test_two_hundred_demonstrations_of_two_thousand_steps_stay_smooth(tabs, begun, tmp_path):
     def slowed(demo):
         rows = np.linspace(0, len(demo) - 1, 2000).astype(int)
-        return Demonstration(
-            demo.name, {key: own[rows] for key, own in demo.observations.items()}, demo.actions[rows]
-        )
+        seen = {key: own[rows] for key, own in demo.observations.items()}
+        return Demonstration(demo.name, seen, demo.actions[rows])
 
     Demonstrations(tuple(map(slowed, pick_and_place(200)))).write(tmp_path / "demos.hdf5")
     with served(begun(path=tmp_path / "demos.hdf5")) as address:

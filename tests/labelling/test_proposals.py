@@ -1,4 +1,4 @@
-"""Proposals given what a person has said: against every path, one after another, and against planted options."""
+"""Proposals given what a person has said: against every path, one by one, and against planted options."""
 
 import itertools
 
@@ -46,9 +46,8 @@ def test_it_is_the_sum_over_the_paths_that_have_the_labels_with_a_regression_of_
         expected, best, whole = np.zeros((4, sizes[level - 1])), (0.0, ()), 0.0
         for path, _, probability in paths(tables, n, 4, sizes):
             own = np.array(path)[:, level - 1]
-            if not all(
-                label < 0 or proposals.options[h] == label for h, label in zip(own, known, strict=True)
-            ):
+            said = [(h, label) for h, label in zip(own, known, strict=True) if label >= 0]
+            if any(proposals.options[h] != label for h, label in said):
                 continue
             p = probability * float(ratio[n, torch.arange(4), torch.as_tensor(own)].sum().exp())
             expected[np.arange(4), own] += p
@@ -99,15 +98,8 @@ def test_the_runs_options_get_the_names_of_those_that_they_stand_for(tmp_path):
     assert fit.names[LEVEL][1:] == ("here", "option 2", "there")
     for start in range(40):
         option = int(np.flatnonzero(mine == truth[named][start])[0])
-        session.edit(
-            {
-                "do": "paint",
-                "demo": demos.names.index(named),
-                "start": start,
-                "stop": start + 1,
-                "option": option,
-            }
-        )
+        span = {"demo": demos.names.index(named), "start": start, "stop": start + 1}
+        session.edit({"do": "paint", **span, "option": option})
     assert fit.names[LEVEL][1:] == ("option 1", "there", "here")
     session.journal.close()
 

@@ -22,7 +22,7 @@ from ddco_pyro.labelling.session import Session
 # --- exports ------------------------------------------------------------------------------------------------
 
 GIVEN, LEFT = range(10), range(10, 25)
-"""The steps of a demonstration that a person gives and leaves open; the others are accepted or left to the model."""
+"""The steps that a person gives and leaves open; others are accepted or left to the model."""
 
 
 @pytest.fixture
@@ -62,9 +62,8 @@ def test_other_programs_get_a_gap_where_steps_are_open_and_who_says_each_segment
     tasks = json.loads((mixed.export("label-studio", tmp_path) / "tasks.json").read_text())
     for index in (0, 1):
         root = ElementTree.parse(folder / f"demo_{index}.eaf").getroot()
-        slots = {
-            own.get("TIME_SLOT_ID"): int(own.get("TIME_VALUE")) // 1000 for own in root.iter("TIME_SLOT")
-        }
+        times = [(own.get("TIME_SLOT_ID"), int(own.get("TIME_VALUE"))) for own in root.iter("TIME_SLOT")]
+        slots = {name: time // 1000 for name, time in times}
         tiers = {
             tier.get("TIER_ID"): {
                 step: own.findtext("ANNOTATION_VALUE")
@@ -104,9 +103,8 @@ def test_labels_of_another_program_are_gone_on_with_by_their_names(begun, run, d
     truth[0][-3:] = 4
     each = (replace(demo, labels={"skill": own}) for demo, own in zip(demos, truth, strict=True))
     Demonstrations(tuple(each), attributes={LABEL_NAMES: json.dumps({"skill": names})}).write(path)
-    session = begun(
-        path=path, fit=replace(run, named={"skill": ("carry", "option 2", "option 3", "option 4")})
-    )
+    named = {"skill": ("carry", "option 2", "option 3", "option 4")}
+    session = begun(path=path, fit=replace(run, named=named))
     own = session.document.names
     assert (own[0], {*own}) == ("carry", {*names})
     for name, expected in zip(demos.names, truth, strict=True):

@@ -47,9 +47,8 @@ def test_before_any_label_the_fit_proposes(begin, run, demos):
         found = session.demo(index)
         assert by_step(found["segments"]) == [(option, "proposed") for option in path.tolist()]
         probability = u[index].numpy()[np.arange(len(path)), path]
-        np.testing.assert_array_equal(
-            unpacked(found["probability"]), np.rint(255 * np.minimum(probability, 1))
-        )
+        expected = np.rint(255 * np.minimum(probability, 1))
+        np.testing.assert_array_equal(unpacked(found["probability"]), expected)
         wrong.append((1 - probability + USUAL * probability).sum())
         assert [own["step"] for own in found["boundaries"]] == (np.flatnonzero(np.diff(path)) + 1).tolist()
         for own in found["boundaries"]:
@@ -69,6 +68,9 @@ paint = {"do": "paint", "demo": 0, "start": 10, "stop": 20, "option": 3}
 SAID = np.repeat([1, 3, 2, 4], [10, 10, 10, 18])
 
 
+SPLIT = {"do": "split", "demo": 0, "step": 15}
+
+
 @pytest.mark.parametrize(
     ("commands", "labels"),
     [
@@ -78,11 +80,8 @@ SAID = np.repeat([1, 3, 2, 4], [10, 10, 10, 18])
         ([{"do": "merge", "demo": 0, "step": 10}], {(10, 30): 3}),
         ([{"do": "move", "demo": 0, "boundary": 20, "to": 25}], {(10, 25): 3}),
         ([{"do": "move", "demo": 0, "boundary": 20, "to": 15}], {(15, 30): 2}),
-        (
-            [{"do": "split", "demo": 0, "step": 15}, {"do": "name", "demo": 0, "step": 15, "option": 4}],
-            {(15, 20): 4},
-        ),
-        ([{"do": "split", "demo": 0, "step": 15}, {"do": "merge", "demo": 0, "step": 12}], {}),
+        ([SPLIT, {"do": "name", "demo": 0, "step": 15, "option": 4}], {(15, 20): 4}),
+        ([SPLIT, {"do": "merge", "demo": 0, "step": 12}], {}),
         ([{"do": "open", "demo": 0, "step": 19}, {"do": "undo"}, {"do": "redo"}], {(10, 20): OPEN}),
     ],
     ids=lambda value: "-".join(own["do"] for own in value) if isinstance(value, list) else "",
@@ -151,9 +150,8 @@ def test_accepting_says_what_is_seen_except_what_is_open(begin):
     assert not session.document.accepted
     seen = [[0, 1], [20, 2]]  # whatever is shown meanwhile
     session.edit({"do": "accept", "demo": 0, "segments": seen})
-    assert session.document.labels["demo_0"].tolist() == [1] * 20 + [2] * (
-        len(session.document.labels["demo_0"]) - 20
-    )
+    labels = session.document.labels["demo_0"].tolist()
+    assert labels == [1] * 20 + [2] * (len(labels) - 20)
 
 
 @pytest.mark.usefixtures("quiet")
@@ -246,10 +244,8 @@ def test_an_excluded_demonstration_is_last_and_in_no_export_and_in_a_mask(begin,
     saved = Demonstrations.read(session.out)
     assert saved.masks["exclude"] == (name,)
     assert saved[first].attributes["note"] == "slipped"
-    assert (
-        name
-        in starting_spec(inspect(session.out), session.out).text.partition("exclude:")[2].partition("\n")[0]
-    )
+    text = starting_spec(inspect(session.out), session.out).text
+    assert name in text.partition("exclude:")[2].partition("\n")[0]
     session.edit({"do": "mark", "demo": first, "mark": "exclude", "value": False})
     session.save()
     assert "exclude" not in Demonstrations.read(session.out).masks
@@ -260,11 +256,8 @@ def test_what_changes_nothing_is_no_edit(begin):
     commands = [paint, {"do": "rename", "option": 1, "text": "come"}, {**paint, "demo": 1, "option": 0}]
     assert all(session.edit(command)["done"] for command in commands)
     content = session.journal.path.read_bytes()
-    again = [
-        *commands,
-        {"do": "name", "demo": 0, "step": 12, "option": 3},
-        {"do": "open", "demo": 1, "step": 12},
-    ]
+    named = {"do": "name", "demo": 0, "step": 12, "option": 3}
+    again = [*commands, named, {"do": "open", "demo": 1, "step": 12}]
     assert not any(session.edit(command)["done"] for command in [*again, {"do": "reopen", "demo": 0}])
     assert session.journal.path.read_bytes() == content
 
@@ -330,13 +323,8 @@ def test_a_command_that_cannot_be_done_is_one_line_and_changes_nothing(begun, co
 def right(session, demos, rest):
     """The share of right steps of these demonstrations, where options are labelled in the opposite order."""
     pairs = [(shown(session)[index][1], demos[index].labels["phase"]) for index in rest]
-    return np.mean(
-        [
-            option == COUNT - truth
-            for steps, own in pairs
-            for (option, _), truth in zip(steps, own, strict=True)
-        ]
-    )
+    each = [one for steps, own in pairs for one in zip(steps, own, strict=True)]
+    return np.mean([option == COUNT - truth for (option, _), truth in each])
 
 
 def test_two_labelled_demonstrations_label_the_others_and_exports_have_the_names(begin, demos, tmp_path):

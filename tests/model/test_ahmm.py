@@ -24,7 +24,7 @@ def run_forward(tables, lengths, seed=0):
 
 
 def latents(trace, depth, steps):
-    """Choices h [N, T, D] and terminations b [N, T, D] of a trace, 1 for the b that the first step does not have."""
+    """Choices h [N, T, D] and terminations b [N, T, D] of a trace, 1 for the b that the first step lacks."""
     nodes = trace.nodes
     choices = [[nodes[f"h_{d}_{t}"]["value"] for d in range(1, depth + 1)] for t in range(steps)]
     ends = [[nodes[f"b_{d}_{t}"]["value"] for d in range(1, depth + 1)] for t in range(1, steps)]
@@ -38,10 +38,10 @@ def repeated(tables, times):
     return Tables(*(tuple(table[:1].expand(times, *table.shape[1:]) for table in part) for part in parts))
 
 
-@pytest.mark.parametrize(
-    ("counts", "hybrid", "steps"),
-    [((2,), (True,), 4), ((2, 2), (False, True), 3), ((1, 1, 1), (True, True, True), 3)],
-)
+CASES = [((2,), (True,), 4), ((2, 2), (False, True), 3), ((1, 1, 1), (True, True, True), 3)]
+
+
+@pytest.mark.parametrize(("counts", "hybrid", "steps"), CASES)
 def test_latents_are_as_frequent_as_the_sum_over_paths_says(counts, hybrid, steps):
     """Controls of density 1 tell nothing, so what is sampled has the marginals of the prior."""
     tables = random_tables(counts, hybrid, steps=steps, seed=7)

@@ -19,24 +19,21 @@ BRANCHES = {
     "network": "branches",
     "of": {"camera": {**CONV, "dropout": 0.2}, "state": {"network": "mlp", "hidden": [4]}},
 }
+IN_WINDOWS = {"network": "lstm", "over": CONV, "hidden": [5, 3], "horizon": 5}
+OVER_BRANCHES = {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}
 NETWORKS: dict[str, dict[str, Any]] = {
     "mlp": {"policy": {"network": "mlp", "hidden": [8], "dropout": 0.3, "inputs": ["state"]}},
     "conv": {"policy": {**CONV, "dropout": 0.3}},
     "lstm over conv": {"policy": {"network": "lstm", "over": CONV, "hidden": 5}},
-    "lstm over conv, a horizon": {
-        "policy": {"network": "lstm", "over": CONV, "hidden": [5, 3], "horizon": 5}
-    },
-    "lstm over branches, a trunk": {
-        "whole": {"network": "lstm", "over": {**BRANCHES, "hidden": [5]}, "hidden": [4, 5]}
-    },
+    "lstm over conv, a horizon": {"policy": IN_WINDOWS},
+    "lstm over branches, a trunk": {"whole": OVER_BRANCHES},
     "branches": {"policy": {**BRANCHES, "hidden": [7]}},
     "constant": {"policy": {"network": "constant"}, "whole": CONV},
     "per_timestep": {"policy": {"network": "per_timestep", "hidden": [4], "inputs": ["state"]}},
 }
 TRAJECTORIES, STEPS = 2, 13
-assert {"linear", *re.findall(r"'network': '(\w+)'", str(NETWORKS))} == set(CLASSES), (
-    "a new network belongs here"
-)
+NAMES = {"linear", *re.findall(r"'network': '(\w+)'", str(NETWORKS))}
+assert set(CLASSES) == NAMES, "a new network belongs here"
 
 
 def hierarchy(network: str, dtype: torch.dtype = torch.float64) -> Hierarchy:

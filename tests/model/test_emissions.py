@@ -1,4 +1,4 @@
-"""Kinds of control against scipy, torch and brute force, and the Pyro program with controls that are given."""
+"""Kinds of control against scipy, torch and brute force, and the Pyro program with given controls."""
 
 import itertools
 
@@ -27,7 +27,7 @@ DRAWS = 600
 
 
 def test_a_control_can_be_conditioned_on():
-    """With every control given the program has the likelihood of the tables; with one changed, that of the changed."""
+    """With each control given the program has the tables' likelihood; with one changed, the changed one's."""
     batch = make_batch()
     with torch.no_grad():
         outputs = make_hierarchy((2,))(batch.inputs)
@@ -37,9 +37,8 @@ def test_a_control_can_be_conditioned_on():
     elbo = pyro.infer.TraceEnum_ELBO(max_plate_nesting=1, strict_enumeration_warning=False)
     conditioned = pyro.condition(ahmm, data=given)
     value = -elbo.loss(conditioned, lambda *_: None, chain, outputs.emissions)
-    assert value == pytest.approx(
-        float(log_likelihood(outputs.tables(actions), batch.lengths).sum()), rel=1e-5
-    )
+    expected = log_likelihood(outputs.tables(actions), batch.lengths).sum()
+    assert value == pytest.approx(float(expected), rel=1e-5)
 
 
 # --- kinds --------------------------------------------------------------------------------------------------
@@ -98,7 +97,7 @@ def hurdle(logit, mean, std=STD):
 
 
 def test_a_hurdle_is_its_value_and_scipys_normal():
-    """One probability for all dimensions; a control of which one dimension alone is at its value is continuous."""
+    """One probability for all dimensions; a control with one dimension alone at its value is continuous."""
     logit, mean = numbers(4, 2, 1), numbers(4, 2, 2, seed=1)
     emission = Hurdle(logit, Gaussian(mean, STD, SCALE.log()))
     actions = torch.tensor([[0.0, 0.0], [0.0, 0.3], [1e-30, 0.0], [-0.0, 0.0]], dtype=torch.float64)
@@ -126,25 +125,23 @@ def test_a_hurdles_divergence_is_the_mean_of_log_ratios():
     assert float(emission.divergence(0)[1]) == pytest.approx(total, abs=5 * variance**0.5)
 
 
+MEAN, AT, OWN = numbers(2, 3, 2, 2), numbers(2, 3, 2, 1, seed=2), torch.stack([STD, 2 * STD])
+SWITCH = numbers(2, 3, 2, 1, seed=1)
 KINDS = {
-    "gaussian": lambda: Gaussian(numbers(2, 3, 2, 2), STD, SCALE.log()),
-    "gaussian, own σ": lambda: Gaussian(numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD]), SCALE.log()),
-    "clipped": lambda: clipped(numbers(2, 3, 2, 2)),
-    "gaussian, σ of each step": lambda: Gaussian(numbers(2, 3, 2, 2), std_of_steps(), SCALE.log()),
-    "clipped, σ of each step": lambda: clipped(numbers(2, 3, 2, 2), std_of_steps()),
+    "gaussian": lambda: Gaussian(MEAN, STD, SCALE.log()),
+    "gaussian, own σ": lambda: Gaussian(MEAN, OWN, SCALE.log()),
+    "clipped": lambda: clipped(MEAN),
+    "gaussian, σ of each step": lambda: Gaussian(MEAN, std_of_steps(), SCALE.log()),
+    "clipped, σ of each step": lambda: clipped(MEAN, std_of_steps()),
     "student": lambda: student(STD),
-    "student, own σ": lambda: student(torch.stack([STD, 2 * STD])),
-    "student beside": lambda: Product((((2, 0), student(STD)), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))),
-    "binary": lambda: Binary(numbers(2, 3, 2, 2)),
+    "student, own σ": lambda: student(OWN),
+    "student beside": lambda: Product((((2, 0), student(STD)), ((1,), Binary(SWITCH)))),
+    "binary": lambda: Binary(MEAN),
     "categorical": lambda: Categorical(numbers(2, 3, 2, 4)),
-    "hurdle": lambda: Hurdle(numbers(2, 3, 2, 1, seed=2), Gaussian(numbers(2, 3, 2, 2), STD, SCALE.log())),
-    "hurdle, clipped, own σ": lambda: hurdle(
-        numbers(2, 3, 2, 1, seed=2), numbers(2, 3, 2, 2), torch.stack([STD, 2 * STD])
-    ),
+    "hurdle": lambda: Hurdle(AT, Gaussian(MEAN, STD, SCALE.log())),
+    "hurdle, clipped, own σ": lambda: hurdle(AT, MEAN, OWN),
     "hurdles": lambda: Product((((1,), one_hurdle(5)), ((0,), one_hurdle(6)))),
-    "product": lambda: Product(
-        (((2, 0), clipped(numbers(2, 3, 2, 2))), ((1,), Binary(numbers(2, 3, 2, 1, seed=1))))
-    ),
+    "product": lambda: Product((((2, 0), clipped(MEAN)), ((1,), Binary(SWITCH)))),
 }
 
 
@@ -216,9 +213,8 @@ def test_draws_of_a_student_have_its_radius_and_its_controller():
     assert stats.kstest(radius, stats.f(2, 4).cdf).pvalue > 0.01
     part = {"scale": [1.0, 1.0], "shift": [0.0, 0.0], "ends": [[], []]}
     for own, z in zip(drawn[:200], noise.numpy(), strict=False):
-        np.testing.assert_allclose(
-            student_control(part, emission.mean[0].numpy(), STD.numpy(), z), own, rtol=1e-10
-        )
+        found = student_control(part, emission.mean[0].numpy(), STD.numpy(), z)
+        np.testing.assert_allclose(found, own, rtol=1e-10)
 
 
 def test_the_divergence_of_students_is_at_least_that_of_draws():
@@ -237,9 +233,8 @@ def test_the_divergence_of_students_is_at_least_that_of_draws():
 
 @pytest.mark.parametrize(("dtype", "precision"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
 def test_log_of_the_normal_distribution_function(dtype, precision):
-    values = torch.cat([torch.linspace(-60, 12, 2001), torch.tensor([-1e9, -1e4, -30.0, 0.0, 40.0])]).to(
-        dtype
-    )
+    far = torch.tensor([-1e9, -1e4, -30.0, 0.0, 40.0])
+    values = torch.cat([torch.linspace(-60, 12, 2001), far]).to(dtype)
     found = LogNormal.apply(values.requires_grad_())
     (slope,) = torch.autograd.grad(found.sum(), values)
     x = values.detach().double().numpy()
@@ -262,14 +257,10 @@ def test_probabilities_sum_to_one_and_other_values_have_none(kind):
     each = torch.stack([emission.log_density(action.expand(2, 3, size)).exp() for action in every])
     torch.testing.assert_close(each.sum(0), torch.ones_like(each[0]))
     for k in range(2):
-        assert torch.equal(
-            emission.log_density(emission.mode[..., k, :])[..., k].exp(), each.max(0)[0][..., k]
-        )
-    for other in (
-        torch.full((2, 3, size), 0.5),
-        torch.full((2, 3, size), -1.0),
-        torch.full((2, 3, size), 7.0),
-    ):
+        found = emission.log_density(emission.mode[..., k, :])[..., k].exp()
+        assert torch.equal(found, each.max(0)[0][..., k])
+    for value in (0.5, -1.0, 7.0):
+        other = torch.full((2, 3, size), value)
         assert (emission.log_density(other.double()) == -INF).all()
 
 
@@ -305,9 +296,8 @@ def test_divergences_are_those_of_torch(kind):
     else:
         p, q = (distributions.Categorical(logits=emission.logits[..., k, :]) for k in (0, 1))
     both = 0.5 * (distributions.kl_divergence(p, q) + distributions.kl_divergence(q, p))
-    torch.testing.assert_close(
-        emission.divergence(0)[..., 1], both if kind == "categorical" else both.sum(-1)
-    )
+    expected = both if kind == "categorical" else both.sum(-1)
+    torch.testing.assert_close(emission.divergence(0)[..., 1], expected)
 
 
 @pytest.mark.parametrize("kind", KINDS)

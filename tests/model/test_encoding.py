@@ -32,9 +32,8 @@ def make_demonstrations():
             "grid": random.normal(2, 5, (steps, 2, 2)),
             "camera": random.integers(0, 256, (steps, 6, 4, 3), dtype=np.uint8),
         }
-        actions = np.column_stack(
-            [random.normal(40, 9, steps), np.full(steps, 2.5), random.normal(0, 1e-3, steps)]
-        )
+        large, small = random.normal(40, 9, steps), random.normal(0, 1e-3, steps)
+        actions = np.column_stack([large, np.full(steps, 2.5), small])
         records.append(Demonstration(f"demo_{number}", observations, actions))
     return Demonstrations(tuple(records))
 
@@ -59,7 +58,7 @@ def rows(key, change=lambda values: values):
 
 
 def test_features_are_standardised_with_differences_behind_their_observation():
-    """Over all steps; differences begin with 0. What never changes is only centred, then moves in its own units."""
+    """Over all steps; differences begin with 0. What never changes is only centred; it moves in its units."""
     encoder = fitted(ObservationSpec(key="pose", differences=True), ObservationSpec(key="grid"))
     found = encoder.inputs(demo.observations for demo in DEMOS).vector
     differences = rows("pose", lambda values: np.diff(values, axis=0, prepend=values[:1]))
@@ -88,9 +87,8 @@ def test_bins_add_up_to_quantiles(key):
     expected[:, np.ptp(raw, axis=0) == 0] = 0  # it never changes
     np.testing.assert_allclose(through.reshape(len(raw), bins, width).mean(1), expected, atol=1e-5)
     np.testing.assert_allclose(seen.mean(0), 0, atol=1e-5)
-    np.testing.assert_allclose(
-        seen.std(0), np.where(np.tile(np.ptp(raw, axis=0) > 0, 1 + bins), 1, 0), atol=1e-5
-    )
+    varies = np.tile(np.ptp(raw, axis=0) > 0, 1 + bins)
+    np.testing.assert_allclose(seen.std(0), np.where(varies, 1, 0), atol=1e-5)
 
 
 def test_a_value_that_most_steps_have_is_one_value_of_a_part():
@@ -106,7 +104,7 @@ def test_a_value_that_most_steps_have_is_one_value_of_a_part():
 
 
 def test_a_part_that_holds_one_value_alone_is_only_centred():
-    """Of two values, one of five parts has them at its ends, and the others are of one; of one value, all are."""
+    """Of two values, one of five parts has them at its ends, and others are of one; of one value, all are."""
     jaw = np.column_stack([np.arange(40) % 2, np.ones(40)])
     encoder = ObservationEncoder([ObservationSpec(key="jaw", bins=5)], {"jaw": (2,)})
     encoder.fit(Demonstrations((Demonstration("demo_0", {"jaw": jaw}, np.zeros((40, 1))),)))
@@ -146,7 +144,7 @@ def test_batches_are_padded_with_zeros_and_images_stay_bytes():
 
 
 def test_the_density_is_in_the_controls_own_units():
-    """log p(a) of a flat policy against scipy's Gaussian of a with the mean and deviation carried over to a's units."""
+    """log p(a) of a flat policy against scipy's Gaussian of a, its moments carried over to a's units."""
     spec = small_spec((), observations=["pose"], control={"std": 0.2})
     torch.manual_seed(0)
     hierarchy = Hierarchy(spec, Dimensions(SHAPES, 3, 5))

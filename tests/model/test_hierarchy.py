@@ -15,11 +15,8 @@ from ddco_pyro.model.networks import Inputs
 def test_gradient_is_the_papers_gradient_equation(emits):
     """∇L of §4.1 (and its hybrid terms, §4.2) with u, v, w summed over every path, against autograd."""
     hierarchy, batch = make_hierarchy((3,), emits).double(), make_batch()
-    batch = Batch(
-        Inputs({"state": batch.inputs.vector.double()}, {}, batch.inputs.time),
-        batch.actions.double(),
-        batch.lengths,
-    )
+    inputs = Inputs({"state": batch.inputs.vector.double()}, {}, batch.inputs.time)
+    batch = Batch(inputs, batch.actions.double(), batch.lengths)
     parameters = list(hierarchy.parameters())
     tables = hierarchy.tabulate(batch)
     found = torch.autograd.grad(log_likelihood(tables, batch.lengths).sum(), parameters, retain_graph=True)
@@ -80,14 +77,10 @@ def test_a_second_derivative_is_never_left_out_in_silence():
 
 
 def test_controls_that_want_a_gradient_get_it():
-    """Through the tables: the gradient of a log-density with respect to the controls (a distribution's value)."""
+    """Through the tables: the gradient of a log-density with respect to controls (a distribution's value)."""
     batch = make_batch()
     tables = make_hierarchy((2,))(batch.inputs).tables(batch.actions.requires_grad_())
-    found, expected = (
-        torch.autograd.grad(
-            log_likelihood(tables, batch.lengths, engine).sum(), batch.actions, retain_graph=True
-        )[0]
-        for engine in ("fused", "enumerate")
-    )
+    values = (log_likelihood(tables, batch.lengths, engine).sum() for engine in ("fused", "enumerate"))
+    found, expected = (torch.autograd.grad(own, batch.actions, retain_graph=True)[0] for own in values)
     assert found.abs().max() > 0.1
     torch.testing.assert_close(found, expected)

@@ -50,9 +50,8 @@ def spec_of(**changes):
 def test_a_mixture_beside_is_the_spec_with_terminations_always():
     spec = spec_of(compare_with=["flat", "mixture", {"kind": "mixture", "optimizer": {"lr": 0.5}}])
     assert list(named_baselines(spec)) == ["flat", "mixture", "mixture_2"]
-    first, second = (
-        baseline_spec(spec, named_baselines(spec)[name], None) for name in ("mixture", "mixture_2")
-    )
+    baselines = named_baselines(spec)
+    first, second = (baseline_spec(spec, baselines[name], None) for name in ("mixture", "mixture_2"))
     (level,) = first.hierarchy.levels
     assert (level.termination, level.policy, first.training) == (
         "always",
@@ -71,12 +70,8 @@ def test_a_grid_of_models_is_one_line():
     """Flat, mixture, options and two levels, each valid by itself, with the parameters that it has alone."""
     spec = spec_of(selection={"grid": {"model": ["flat", "mixture", "options", TWO]}})
     found = candidates(spec, Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12))
-    assert [one.name for one in found] == [
-        "model = flat",
-        "model = mixture",
-        "model = options",
-        "model = [2, 2]",
-    ]
+    names = ["model = flat", "model = mixture", "model = options", "model = [2, 2]"]
+    assert [one.name for one in found] == names
     assert [model_name(one.spec) for one in found] == ["flat", "mixture", "ddco", "ddco"]
     _, mixture, options, _ = (one.parameters for one in found)
     assert options - mixture == 2 * (4 + 1 + 1)  # two linear terminations of five numbers
@@ -85,7 +80,7 @@ def test_a_grid_of_models_is_one_line():
 
 
 def test_levels_above_start_from_segments_without_memory_too():
-    """ψ of a level whose options end after every step stays exactly 1 in the EM that levels above start from."""
+    """ψ of a level whose options end after every step stays exactly 1 in the EM that starts upper levels."""
     hierarchy, batch = make_hierarchy((2, 2), memoryless=[2]), make_batch(4, 6)
     with torch.no_grad():
         pieces = [(hierarchy.tabulate(batch), batch.lengths)]
@@ -111,12 +106,10 @@ def test_a_fit_trains_it_beside_with_the_same_budget(run):
     assert mixture.metrics.engine_check.value < 1e-6
     assert mixture.spec.training.labels == run.spec.training.labels
     again = ddco_pyro.load(run.folder / "baselines" / "mixture")
-    np.testing.assert_array_equal(
-        again.log_likelihood(run.demonstrations), mixture.log_likelihood(run.demonstrations)
-    )
-    lasting = (
-        parameters(build_hierarchy(run.spec, Dimensions.of(run.demonstrations))) - mixture.metrics.parameters
-    )
+    before, after = (one.log_likelihood(run.demonstrations) for one in (mixture, again))
+    np.testing.assert_array_equal(after, before)
+    whole = build_hierarchy(run.spec, Dimensions.of(run.demonstrations))
+    lasting = parameters(whole) - mixture.metrics.parameters
     assert lasting == sum(p.numel() for p in run.hierarchy.levels[0].termination.parameters())
 
 

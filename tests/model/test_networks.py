@@ -21,11 +21,10 @@ from torch import nn
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.conv import POOLED
 
+DEEP = [{"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}]
 
-@pytest.mark.parametrize(
-    "settings",
-    [{"network": "linear"}, {"network": "constant"}, {"hidden": [8]}, {"hidden": [8, 6], "dropout": 0.5}],
-)
+
+@pytest.mark.parametrize("settings", [{"network": "linear"}, {"network": "constant"}, *DEEP])
 def test_stacked_networks_are_separate_networks(settings):
     network, inputs = make(**settings), make_inputs()
     read = inputs.vector[..., :0] if "constant" in settings.values() else inputs.vector
@@ -38,10 +37,8 @@ CONVOLUTION = [{"filters": 3, "kernel": 5, "stride": 2, "padding": 2}]
 
 def test_a_standardised_picture_is_seen_whatever_its_brightness_and_contrast():
     """As numpy standardises it; half as strong and darker or brighter it gives the same."""
-    shape, settings = (
-        InputShape({}, {"camera": PIXELS}),
-        {"network": "conv", "layers": CONVOLUTION, "pool": "flatten"},
-    )
+    shape = InputShape({}, {"camera": PIXELS})
+    settings = {"network": "conv", "layers": CONVOLUTION, "pool": "flatten"}
     plain, network = make(shape, **settings), make(shape, **settings, standardize=True)
     network.load_state_dict(plain.state_dict())
     picture = 2 * torch.randint(0, 64, (1, 1, *PIXELS), dtype=torch.uint8)
@@ -126,10 +123,10 @@ POOLS = {
 ACTIVATIONS = {"relu": nn.ReLU(), "leaky_relu": nn.LeakyReLU(0.01), "elu": nn.ELU(), "tanh": nn.Tanh()}
 
 
-@pytest.mark.parametrize(
-    ("pool", "activation"),
-    [("mean", "relu"), ("flatten", "leaky_relu"), ("spatial_softmax", "elu"), ("mean", "tanh")],
-)
+POOLED_BY = [("mean", "relu"), ("flatten", "leaky_relu"), ("spatial_softmax", "elu"), ("mean", "tanh")]
+
+
+@pytest.mark.parametrize(("pool", "activation"), POOLED_BY)
 def test_several_convolutions_are_separate_networks(pool, activation):
     """The activation follows every convolution and every hidden layer."""
     layers = [{"filters": 3, "kernel": 4, "stride": 2, "padding": 1}, {"filters": 2, "kernel": 3}]
@@ -151,9 +148,8 @@ def test_branches_read_each_their_own_and_are_joined():
     shape = InputShape({"pose": 2, "goal": 3, "other": 4}, {"camera": PIXELS})
     pair = {"network": "linear", "inputs": ["goal", "pose"]}
     picture = {"network": "conv", "layers": CONVOLUTION, "hidden": [6]}
-    network = make(
-        shape, network="branches", of={"camera": picture, "pair": pair, "goal": {"hidden": [5]}}, hidden=[8]
-    )
+    of = {"camera": picture, "pair": pair, "goal": {"hidden": [5]}}
+    network = make(shape, network="branches", of=of, hidden=[8])
     inputs = random_inputs(shape, 2, LONGEST, 0)
     seen = Inputs({}, inputs.images, inputs.time)
     camera, _, goal = network.of
@@ -196,9 +192,8 @@ def test_a_network_of_ones_own():
 
 
 def test_another_network_reads_as_many_of_its_numbers_as_its_class_says():
-    over = [
-        make(network="lstm", over={"network": f"user_networks:{name}"}).over for name in ("Own", "Narrow")
-    ]
+    networks = [{"network": f"user_networks:{name}"} for name in ("Own", "Narrow")]
+    over = [make(network="lstm", over=own).over for own in networks]
     assert [network.features for network in over] == [64, 5]
 
 
@@ -206,15 +201,8 @@ SHOULD = "it has to be a tensor [N, T, copies, outputs], here"
 STATE = "has initial_state(N), which has to give a tuple of tensors [N, ...]; each call"
 BY_STEPS = "gives other outputs step by step than for a whole trajectory: its state has to hold all"
 ALONE = "gives a step alone other outputs than within its trajectory: it depends on earlier steps"
-MEMORIES = [
-    "over time",
-    "over trajectories",
-    "differences",
-    "later steps",
-    "whole trajectory",
-    "whole batch",
-    "chance",
-]
+MEMORIES = ["over time", "over trajectories", "differences", "later steps"]
+MEMORIES += ["whole trajectory", "whole batch", "chance"]
 
 
 @pytest.mark.parametrize(
@@ -237,31 +225,22 @@ def test_a_network_of_ones_own_is_tried_when_it_is_made(network, how, message):
     assert said.startswith(f"network 'user_networks:{network}' {message}")
 
 
+PICTURE = InputShape({"state": 3}, {"camera": PIXELS})
+SMALL = InputShape({}, {"camera": (6, 6, 3)})
+LAYERS = [{"filters": 2, "kernel": 5}, {"filters": 2, "kernel": 3}]
+OF_NONE = {"network": "branches", "of": {"camera": {"network": "conv"}}}
+NO_MODULE = "'no_such_module:Net' cannot be imported: No module named"
+
+
 @pytest.mark.parametrize(
     ("shape", "settings", "message"),
     [
-        (
-            InputShape({"state": 3}, {"camera": PIXELS}),
-            {"network": "linear"},
-            "reads vectors, but camera are images",
-        ),
+        (PICTURE, {"network": "linear"}, "reads vectors, but camera are images"),
         (SHAPE, {"network": "conv"}, "needs an image among the observations"),
-        (
-            SHAPE,
-            {"network": "branches", "of": {"camera": {"network": "conv"}}},
-            "^of.camera: inputs: there is no",
-        ),
+        (SHAPE, OF_NONE, "^of.camera: inputs: there is no"),
         (SHAPE, {"inputs": ["stat"]}, r"no observation 'stat' \(did you mean 'state'\?\); there is: state"),
-        (
-            InputShape({}, {"camera": (6, 6, 3)}),
-            {"network": "conv", "layers": [{"filters": 2, "kernel": 5}, {"filters": 2, "kernel": 3}]},
-            "camera of 6 × 6 is too small for its layers",
-        ),
-        (
-            SHAPE,
-            {"network": "no_such_module:Net"},
-            "'no_such_module:Net' cannot be imported: No module named",
-        ),
+        (SMALL, {"network": "conv", "layers": LAYERS}, "camera of 6 × 6 is too small for its layers"),
+        (SHAPE, {"network": "no_such_module:Net"}, NO_MODULE),
         (SHAPE, {"network": "user_networks:NotANetwork"}, "is not a torch.nn.Module class"),
         (SHAPE, {"network": "user_networks:Own", "options": {"gain": -1}}, "the gain has to be positive"),
     ],

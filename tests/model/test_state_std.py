@@ -23,7 +23,7 @@ def softplus(values):
 
 @pytest.mark.parametrize("counts", [(), (3,), (2, 2)])
 def test_density_is_scipys_with_the_sigma_of_each_step(counts):
-    """Of every caller, the meta-policy among them: two means, then two y, by the formula of the documentation."""
+    """Of every caller, the meta-policy too: two means, then two y, by the formula of the documentation."""
     emits = ("options", "control") if counts else ("control",)
     hierarchy, batch = varied(make_hierarchy(counts, emits, std={**OF_STATE, "floor": 0.05})), make_batch()
     hierarchy.scaling.scale.copy_(torch.tensor([3.0, 0.2]))
@@ -56,9 +56,8 @@ def test_at_first_it_is_the_same_everywhere(network):
     for caller in hierarchy(batch.inputs).callers[:1]:
         torch.testing.assert_close(caller.emission.std, torch.full((*batch.inputs.batch, 2, 2), INITIAL_STD))
         assert caller.emission.mean.std() > 0.01
-        gradient = torch.autograd.grad(
-            caller.log_density(batch.actions).sum(), hierarchy.levels[0].policy.parameters()
-        )
+        density = caller.log_density(batch.actions).sum()
+        gradient = torch.autograd.grad(density, hierarchy.levels[0].policy.parameters())
         assert all((slope != 0).any() for slope in gradient if slope.shape[-1] == 4)
 
 
@@ -113,14 +112,13 @@ def fitted(tmp_path_factory):
 
 
 def test_a_planted_sigma_of_the_state_is_found(fitted):
-    """Held out: as good as the truth, and better than a constant σ, which is least squares, by many standard errors."""
+    """Held out: as good as the truth, and better than constant σ, least squares, by many standard errors."""
     fit, demos, truth = fitted
     names = [row.name for row in fit.metrics.valid]
     found = fit.metrics.log_likelihood_per_step.valid
     assert found == pytest.approx(np.mean([truth[name] for name in names]), abs=0.02)
-    train, valid = (
-        [demo for demo in demos if (demo.name in names) == held_out] for held_out in (False, True)
-    )
+    kept = [[demo for demo in demos if (demo.name in names) == held_out] for held_out in (False, True)]
+    train, valid = kept
     seen, actions = zip(*(_rows(part) for part in (train, valid)), strict=True)
     weights = np.linalg.lstsq(seen[0], actions[0], rcond=None)[0]
     std = (actions[0] - seen[0] @ weights).std(0)

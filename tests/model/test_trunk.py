@@ -29,7 +29,7 @@ def value_of(hierarchy):
 
 
 def test_it_is_what_each_would_give_with_these_weights_and_learns_from_all():
-    """Networks that begin with a copy of it have the same likelihood; its gradient is the sum of all of theirs."""
+    """Networks that begin with a copy of it have the same likelihood; its gradient is their sum."""
     one, many = made(spec_of(LINEAR, SEES)), made(spec_of(SEES))
     shared, firsts = one.trunk.layers[0], [network.layers[0] for network in many.networks().values()]
     with torch.no_grad():
@@ -49,12 +49,8 @@ def test_it_is_what_each_would_give_with_these_weights_and_learns_from_all():
 def test_it_is_trained_with_the_lowest_level_and_with_all():
     spec = spec_of(LINEAR, SEES, layerwise=True)
     names = [name for name, _ in made(spec).named_parameters()]
-    trained = {
-        stage.name: [name for name in names if name.startswith(stage.trained)] for stage in plan(spec, 2)
-    }
-    assert [name for name, own in trained.items() if "trunk.layers.0.weight" in own] == [
-        "vq-1",
-        "level-1",
-        "joint",
-    ]
+    stages = {stage.name: stage.trained for stage in plan(spec, 2)}
+    trained = {stage: [name for name in names if name.startswith(own)] for stage, own in stages.items()}
+    with_trunk = [name for name, own in trained.items() if "trunk.layers.0.weight" in own]
+    assert with_trunk == ["vq-1", "level-1", "joint"]
     assert trained["joint"] == [name for name in names if not name.startswith(("encoder.", "scaling."))]

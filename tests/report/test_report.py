@@ -59,12 +59,8 @@ def labelled(tmp_path_factory):
 def deep(tmp_path_factory):
     """Two hybrid levels, two restarts, two baselines, no labels, no position, rollouts and films."""
     lower = {"name": "skill", "count": 2, "policy": LINEAR, "termination": LINEAR}
-    upper = {
-        "name": "phase",
-        "count": 2,
-        "policy": {**LINEAR, "emits": ["options", "control"]},
-        "termination": LINEAR,
-    }
+    policy = {**LINEAR, "emits": ["options", "control"]}
+    upper = {"name": "phase", "count": 2, "policy": policy, "termination": LINEAR}
     found, demos = run(
         tmp_path_factory.mktemp("deep"),
         made(size=2),
@@ -77,13 +73,10 @@ def deep(tmp_path_factory):
     frames = np.random.default_rng(0).integers(0, 255, (5, 48, 64, 3), dtype=np.uint8)
     (found.folder / "videos").mkdir()
     for name in ("flat-1000", "ddco-1000", "ddco-1001"):
-        write_film(
-            found.folder / "videos" / f"{name}.mp4",
-            Episode(1000, demos[0], {}, np.zeros((4, 0), int), frames),
-        )
-    (found.folder / "rollouts.csv").write_text(
-        "method,seed,success\nddco,1000,1.0\nddco,1001,0.0\nflat,1000,\n"
-    )
+        episode = Episode(1000, demos[0], {}, np.zeros((4, 0), int), frames)
+        write_film(found.folder / "videos" / f"{name}.mp4", episode)
+    table = "method,seed,success\nddco,1000,1.0\nddco,1001,0.0\nflat,1000,\n"
+    (found.folder / "rollouts.csv").write_text(table)
     found = load(found.folder)
     return found, write_report(found, demos).read_text()
 
@@ -110,7 +103,7 @@ def test_the_page_is_one_self_contained_file(labelled, deep):
 
 
 def rows_of(page):
-    """The list of demonstrations: (name, where its link leads, whether it is marked as held out, numbers) of each."""
+    """The list of demonstrations: (name, where its link leads, whether it is held out, numbers) of each."""
     (section,) = re.findall(r'<section id="demonstrations">(.*?)</section>', page, re.DOTALL)
     found = []
     for row in re.findall(r"<tr><td>(.*?)</tr>", section, re.DOTALL):
@@ -129,16 +122,14 @@ def test_demonstrations_are_listed_worst_first_with_links_to_their_segments(labe
     assert [name for name, *_ in listed] == sorted(demos.names, key=per_step.__getitem__)
     for name, link, held_out, numbers in listed:
         assert held_out == (name in valid)
-        assert numbers[:2] == [
-            words.duration(20, len(demos[demos.names.index(name)])),
-            words.number(per_step[name]),
-        ]
+        steps = len(demos[demos.names.index(name)])
+        assert numbers[:2] == [words.duration(20, steps), words.number(per_step[name])]
         assert page.count(f'id="{link}"') == 1
         assert tracks(page)[name][:2] == (link, held_out)
 
 
 def test_agreement_and_lengths_are_shown_beside_a_yardstick(labelled):
-    """Agreement beside that of equal lengths, here the labels themselves or one step off; steps beside seconds."""
+    """Agreement beside that of equal lengths, here the labels or a step off; steps beside seconds."""
     found, page, _ = labelled
     (section,) = re.findall(r'<section id="agreement">(.*?)</section>', page, re.DOTALL)
     rows = dict(re.findall(r"<tr><td>([a-z][^<]*)</td><td>([^<]*)</td>", section))
@@ -152,10 +143,8 @@ def test_agreement_and_lengths_are_shown_beside_a_yardstick(labelled):
     assert float(rows["equal lengths, training"]) > 0.7
     for use in found.metrics.options[0][1:]:
         assert f"<td>{use.segments}</td><td>{words.duration(20, use.length)}</td>" in page
-        assert (
-            f"<dd>{use.segments}</dd>\n<dt>Median length</dt><dd>{words.duration(20, use.length)}</dd>"
-            in page
-        )
+        length = f"<dt>Median length</dt><dd>{words.duration(20, use.length)}</dd>"
+        assert f"<dd>{use.segments}</dd>\n{length}" in page
 
 
 def test_every_option_is_shown_beside_the_one_that_it_is_most_like(deep):
@@ -195,9 +184,8 @@ def test_the_top_of_the_page_is_skills_their_agreement_and_what_is_doubtful(labe
     found, page, _ = labelled
     names = sections(page)
     assert [name for name, folded in names if not folded] == ["test", "skills", "segments", "agreement"]
-    assert {("learning", True), ("dimensions", True), ("demonstrations", True), ("likelihood", True)} < set(
-        names
-    )
+    folded = {(name, True) for name in ("learning", "dimensions", "demonstrations", "likelihood")}
+    assert folded < set(names)
     header = re.search("<header>.*?</header>", page, re.DOTALL)[0]
     fitted = datetime.fromtimestamp((found.folder / "model.safetensors").stat().st_mtime)
     assert "<h1>demos.hdf5 <small>options, " in header
@@ -254,9 +242,8 @@ def test_films_past_the_limit_are_links(deep, monkeypatch):
 
 def test_names_are_escaped(tmp_path):
     key, training = "$x_{<img>$", {"epochs": 1, "starts": ["random"]}
-    odd = [
-        replace(one, name=f"<i>{one.name}", observations={key: one.observations["place"]}) for one in made(5)
-    ]
+    places = [(one, {key: one.observations["place"]}) for one in made(5)]
+    odd = [replace(one, name=f"<i>{one.name}", observations=seen) for one, seen in places]
     changes = {"observations": [key], "training": training, "compare_with": []}
     page = write_report(*run(tmp_path, Demonstrations(tuple(odd)), "<b>&run", **changes)).read_text()
     assert not re.search("<(b|i|img)>", page)

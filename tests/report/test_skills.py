@@ -1,4 +1,4 @@
-"""Skills of the report beside segments written by hand: transitions, instances, contact sheets, films, drawings."""
+"""Skills of the report beside segments written by hand: transitions, instances, sheets, films, drawings."""
 
 import base64
 import io
@@ -40,9 +40,8 @@ def test_transitions_are_those_counted_by_hand():
     expected[1, 2], expected[2, 3], expected[2, 1] = 2, 1, 1
     expected[3, 4], expected[2, 4], expected[1, 4] = 1, 1, 1
     np.testing.assert_array_equal(counts, expected)
-    drawn = transition_graph(
-        counts, [0, 7 / 17, 8 / 17, 2 / 17], ["control", "a<b", "place", "go"], [1, 2, 3]
-    )
+    shares, names = [0, 7 / 17, 8 / 17, 2 / 17], ["control", "a<b", "place", "go"]
+    drawn = transition_graph(counts, shares, names, [1, 2, 3])
     titles = re.findall(r"<title>([^<]*): (\d+) of (\d+)</title>", drawn)
     assert {(name, int(a), int(b)) for name, a, b in titles} == {
         ("start → a&lt;b", 2, 3), ("start → place", 1, 3), ("a&lt;b → place", 2, 3), ("place → go", 1, 3),

@@ -47,10 +47,8 @@ class Planted:
         rng = np.random.default_rng(0)
         demos = []
         for number, options in enumerate(self.options):
-            seen = {
-                "arm/joints": rng.normal(size=(len(options), 3)),
-                "jaw": rng.normal(size=(len(options), 1)),
-            }
+            sizes = {"arm/joints": 3, "jaw": 1}
+            seen = {key: rng.normal(size=(len(options), size)) for key, size in sizes.items()}
             demos.append(Demonstration(f"demo_{number}", seen, rng.normal(size=(len(options), 2))))
         self.demos = Demonstrations(tuple(demos), attributes={"control_frequency": frequency})
         self.demos.write(self.file)
@@ -112,9 +110,12 @@ def prepare(planted, kind):
 def arrays(group):
     """Every dataset below a group, by name."""
     found = {}
-    group.visititems(
-        lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {})
-    )
+
+    def visit(name, item):
+        if isinstance(item, h5py.Dataset):
+            found[name] = item[()]
+
+    group.visititems(visit)
     return found
 
 
@@ -155,8 +156,8 @@ def test_an_order_that_differs_is_refused_or_left_out(tmp_path):
     with pytest.raises(BadInput) as refused:
         planted.write("--mimicgen", "copy.hdf5")
     assert str(refused.value) == (
-        "--mimicgen: demo_3: its subtasks are reach, place, reach, place, and those of 3 of 4 demonstrations are "
-        "reach, grasp, place; --same-order leaves such demonstrations out (1 of 4)"
+        "--mimicgen: demo_3: its subtasks are reach, place, reach, place, and those of 3 of 4 demonstrations "
+        "are reach, grasp, place; --same-order leaves such demonstrations out (1 of 4)"
     )
     assert not (tmp_path / "copy.hdf5").exists()
     with h5py.File(planted.write("--mimicgen", "copy.hdf5", same_order=True)) as copy:
@@ -202,11 +203,8 @@ def test_annotations_are_imported_as_labels_with_names(dataset, tmp_path):
     """As the page on which LeRobot's users label keeps them, for some episodes."""
     atom = {"role": "assistant", "style": "subtask", "tool_calls": None}
     memory = {"role": "assistant", "style": "memory", "content": "seen", "timestamp": 0.0}
-    atoms = [
-        {**atom, "content": "lift it", "timestamp": 0.3},
-        memory,
-        {**atom, "content": "go", "timestamp": 0.1},
-    ]
+    early = {**atom, "content": "go", "timestamp": 0.1}
+    atoms = [{**atom, "content": "lift it", "timestamp": 0.3}, memory, early]
     annotations = {"version": 2, "schema": {}, "episodes": {"0": {"atoms": atoms}, "2": {"atoms": []}}}
     (dataset / "meta" / "lerobot_annotations.json").write_text(json.dumps(annotations))
     import_demonstrations(dataset, tmp_path / "imported.hdf5")
@@ -236,9 +234,8 @@ def test_the_stages_of_sarm(tmp_path):
     out = planted.write("--sarm", "dataset", demos=LEROBOT)
     rows = parquet.read_table(next((out / "meta" / "episodes").rglob("*.parquet"))).to_pylist()
     for number, row in enumerate(rows):
-        stages = zip(
-            *(row[f"dense_subtask_{key}"] for key in ("names", "start_frames", "end_frames")), strict=True
-        )
+        columns = [row[f"dense_subtask_{key}"] for key in ("names", "start_frames", "end_frames")]
+        stages = zip(*columns, strict=True)
         assert [(name, start, end + 1) for name, start, end in stages] == planted.runs(number)
     shares = json.loads((out / "meta" / "temporal_proportions_dense.json").read_text())
     assert list(shares) == ["reach", "grasp", "place"]
@@ -255,10 +252,8 @@ def test_a_copy_of_a_dataset_gets_stages_beside_its_subtasks(tmp_path):
     assert (second / "meta" / "lerobot_annotations.json").read_text() == (
         first / "meta" / "lerobot_annotations.json"
     ).read_text()
-    names = [
-        parquet.read_schema(next((one / "meta" / "episodes").rglob("*.parquet"))).names
-        for one in (second, third)
-    ]
+    files = [next((one / "meta" / "episodes").rglob("*.parquet")) for one in (second, third)]
+    names = [parquet.read_schema(file).names for file in files]
     assert names[0] == names[1]
     (tmp_path / "taken").mkdir()
     with pytest.raises(BadInput, match="taken: exists; remove it, or choose another --sarm"):
@@ -355,11 +350,8 @@ def test_a_policy_for_lerobot_is_an_export_with_lerobots_files(toy_run, tmp_path
     )
     for name in ("controller.json", "runner.py"):
         assert policy[name] == exported[name]
-    assert policy.keys() - exported.keys() == {
-        "config.json",
-        "policy_preprocessor.json",
-        "policy_postprocessor.json",
-    }
+    more = {"config.json", "policy_preprocessor.json", "policy_postprocessor.json"}
+    assert policy.keys() - exported.keys() == more
     config = json.loads(policy["config.json"])
     assert config["type"] == "ddco"
     assert config["input_features"]["observation.offsets"] == {"type": "STATE", "shape": [4]}

@@ -72,19 +72,17 @@ def test_they_are_the_fits_own(toy_run, toy_spec, file, monkeypatch):
         np.testing.assert_array_equal(one.labels["phase"], demo.labels["phase"])
 
 
+NOTHING = "name what to write, such as --html PAGE or --csv FILE; labels for each step go to"
+NO_DATASET = "demos.hdf5: is no LeRobot dataset, which --sarm needs; name another format, such as"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            ["--level", "option"],
-            "name what to write, such as --html PAGE or --csv FILE; labels for each step go to",
-        ),
+        (["--level", "option"], NOTHING),
         (["--in-place", "--out", "copy.hdf5"], "--out and --in-place exclude each other; keep one"),
         (["--mimicgen", "copy.hdf5"], "demo_0: has no datagen_info/eef_pose"),
-        (
-            ["--sarm", "copy"],
-            "demos.hdf5: is no LeRobot dataset, which --sarm needs; name another format, such as",
-        ),
+        (["--sarm", "copy"], NO_DATASET),
     ],
 )
 def test_what_to_write_has_to_be_said(toy_run, file, monkeypatch, options, message):
@@ -168,21 +166,14 @@ def test_intervals_are_those_of_the_posterior_draws(toy_run, file):
         assert level.intervals.shape == (len(starts), 2)
         assert level.intervals[0].tolist() == [0, 0]
         ((options,), (ended,)) = piece.draws(row, 100, (0, len(demo)))
-        for place, (before, start, after) in enumerate(
-            zip(starts, starts[1:], [*starts[2:], len(demo)], strict=False)
-        ):
+        spans = zip(starts, starts[1:], [*starts[2:], len(demo)], strict=False)
+        for place, (before, start, after) in enumerate(spans):
             a, b = level.options[start - 1], level.options[start]
-            at = [
-                min(steps, key=lambda step: (abs(step - start), step))
-                for path, new in zip(options, ended, strict=True)
-                if (
-                    steps := [
-                        t
-                        for t in range(before + 1, after)
-                        if path[t - 1] == a and path[t] == b and new[t] == 1
-                    ]
-                )
-            ]
+            at = []
+            for path, new in zip(options, ended, strict=True):
+                pairs = [(t, path[t - 1], path[t]) for t in range(before + 1, after) if new[t] == 1]
+                if steps := [t for t, left, begun in pairs if (left, begun) == (a, b)]:
+                    at.append(min((abs(step - start), step) for step in steps)[1])
             low, high = level.intervals[place + 1]
             within = np.mean([low <= step <= high for step in at]) if at else 1.0
             assert within >= 0.9
@@ -204,9 +195,8 @@ def test_the_page_marks_what_was_held_out_and_says_how_labels_agree(toy_run, toy
     for name, part in split.items():
         (path,) = toy_run.segment(part)
         found = np.concatenate(path)
-        scores[name] = normalized_mutual_info_score(
-            np.concatenate([demo.labels["phase"] for demo in part]), found
-        )
+        truth = np.concatenate([demo.labels["phase"] for demo in part])
+        scores[name] = normalized_mutual_info_score(truth, found)
     assert "Agreement with the label “phase”" in text
     assert f"<td>options, 3 held out</td><td>{scores['valid']:.2f}</td>" in text
     assert f"<td>options, 9 others</td><td>{scores['train']:.2f}</td>" in text
@@ -240,21 +230,15 @@ def test_the_page_escapes_what_it_shows(toy_run, tmp_path, toy_spec):
 # --- what cannot be segmented -------------------------------------------------------------------------------
 
 
+WIDTH = "obs/offsets has shape (3,) at each step, the run was fitted to (4,)"
+MISSING = "there is no observation 'offsets' (did you mean 'offset'?), which the run"
+
+
 @pytest.mark.parametrize(
     ("key", "other", "width", "message"),
     [
-        (
-            "obs/offsets",
-            "obs/offsets",
-            3,
-            "obs/offsets has shape (3,) at each step, the run was fitted to (4,)",
-        ),
-        (
-            "obs/offsets",
-            "obs/offset",
-            4,
-            "there is no observation 'offsets' (did you mean 'offset'?), which the run",
-        ),
+        ("obs/offsets", "obs/offsets", 3, WIDTH),
+        ("obs/offsets", "obs/offset", 4, MISSING),
         ("actions", "actions", 1, "actions has shape (1,) at each step, the run was fitted to (2,)"),
     ],
 )
@@ -306,19 +290,13 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
 
     ``fixtures/read_formats.py`` has LeRobot read what is written here; 0.6.1 did.
     """
-    options = {
-        int(key): np.array(value)
-        for key, value in json.loads((LANGUAGE / "options.json").read_text()).items()
-    }
-    level = {
-        key: LevelLabels(value, np.ones(len(value), bool), np.ones(len(value)))
-        for key, value in options.items()
-    }
-    found = Segmented(
-        tuple(Segments(f"demo_{key}", {"skill": one}, 0.0, False) for key, one in level.items()),
-        {"skill": 2},
-        10.0,
-    )
+    options = json.loads((LANGUAGE / "options.json").read_text())
+    options = {int(key): np.array(value) for key, value in options.items()}
+    level = {}
+    for key, value in options.items():
+        level[key] = LevelLabels(value, np.ones(len(value), bool), np.ones(len(value)))
+    each = (Segments(f"demo_{key}", {"skill": one}, 0.0, False) for key, one in level.items())
+    found = Segmented(tuple(each), {"skill": 2}, 10.0)
     with open_source(LEROBOT) as source:
         fit = SimpleNamespace(names={"skill": ("control", "option 1", "option 2")})
         write_subtasks(Asked("--lerobot", tmp_path / "out", fit, source, "skill"), found)
@@ -329,12 +307,8 @@ def test_subtasks_are_written_as_lerobot_writes_them(tmp_path):
     ours, theirs = (json.loads(path.read_text())["features"] for path in infos)
     assert ours == theirs
     frames = parquet.ParquetFile(next((tmp_path / "out" / "data").rglob("*.parquet")))
-    assert [frames.metadata.row_group(group).num_rows for group in range(frames.num_row_groups)] == [
-        5,
-        6,
-        7,
-        8,
-    ]
+    groups = (frames.metadata.row_group(group) for group in range(frames.num_row_groups))
+    assert [group.num_rows for group in groups] == [5, 6, 7, 8]
 
 
 def test_a_copy_with_subtasks(lerobot_run, tmp_path):

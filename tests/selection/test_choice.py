@@ -1,4 +1,4 @@
-"""From scores to a choice, against sums by hand: means, paired differences, standard errors, and the two rules."""
+"""From scores to a choice, against sums by hand: means, paired differences, standard errors, two rules."""
 
 import math
 import re
@@ -60,12 +60,8 @@ def test_the_choice_is_the_smallest_within_one_standard_error_of_the_best():
     found = rows([(base - 0.66).tolist(), (base - 0.63).tolist(), base.tolist(), (base - 0.01).tolist()])
     assert found.best.error == pytest.approx(error)
     assert (found.best.candidate.number, found.chosen.candidate.number) == (2, 1)
-    assert [row["within_one_standard_error"] for row in as_data(found)["candidates"]] == [
-        False,
-        True,
-        True,
-        True,
-    ]
+    within = [row["within_one_standard_error"] for row in as_data(found)["candidates"]]
+    assert within == [False, True, True, True]
 
 
 def test_the_paired_difference_is_shown_and_not_the_rule():
@@ -99,24 +95,17 @@ def test_where_all_have_failed_there_is_no_choice():
     assert [row.mean for row in found.rows] == [1.0, None]
 
 
+COUNT = "hierarchy.levels.0.count"
+
+
 @pytest.mark.parametrize(
     ("path", "grid", "means", "said"),
     [
-        (
-            "hierarchy.levels.0.count",
-            [1, 2, 4],
-            [0.0, 1.0, 2.0],
-            "count = 4 is the best, and the largest of the grid",
-        ),
-        (
-            "hierarchy.levels.0.count",
-            [2, 3, 4],
-            [2.0, 1.0, 0.0],
-            "count = 2 is the best, and the smallest of the grid",
-        ),
+        (COUNT, [1, 2, 4], [0.0, 1.0, 2.0], "count = 4 is the best, and the largest of the grid"),
+        (COUNT, [2, 3, 4], [2.0, 1.0, 0.0], "count = 2 is the best, and the smallest of the grid"),
         ("control.std", [0.1, 0.2], [0.0, 1.0], "std = 0.2 is the best, and the largest"),
-        ("hierarchy.levels.0.count", [1, 2, 4], [0.0, 3.0, 2.0], ""),
-        ("hierarchy.levels.0.count", [1, 2], [1.0, 0.0], ""),
+        (COUNT, [1, 2, 4], [0.0, 3.0, 2.0], ""),
+        (COUNT, [1, 2], [1.0, 0.0], ""),
         ("observations", [["a"], ["a", "b"]], [0.0, 1.0], ""),
     ],
 )
@@ -149,21 +138,18 @@ SIZE = Dimensions(PLACE | TURN, 2, 10)
 
 
 def with_grid(grid, **changes):
-    return parse_spec(
-        {**DATA, "demonstrations": {"path": "demos.hdf5"}, "selection": {"grid": grid}, **changes}
-    )
+    chosen = {"demonstrations": {"path": "demos.hdf5"}, "selection": {"grid": grid}}
+    return parse_spec({**DATA, **chosen, **changes})
 
 
 def test_every_point_of_the_grid_is_a_candidate():
-    """With k linear policies from 3 features to 2 controls, k terminations, and a meta-policy over k options."""
-    spec = with_grid(
-        {"hierarchy.levels.0.count": [1, 3], "control.std": [0.1, 0.2, 0.5]}, compare_with=["flat"]
-    )
+    """With k linear policies from 3 features to 2 controls, k terminations, a meta-policy over options."""
+    grid = {"hierarchy.levels.0.count": [1, 3], "control.std": [0.1, 0.2, 0.5]}
+    spec = with_grid(grid, compare_with=["flat"])
     found = candidates(spec, SIZE)
     assert [one.number for one in found] == list(range(6))
-    assert [tuple(one.values.values()) for one in found] == [
-        (k, std) for k in (1, 3) for std in (0.1, 0.2, 0.5)
-    ]
+    points = [(k, std) for k in (1, 3) for std in (0.1, 0.2, 0.5)]
+    assert [tuple(one.values.values()) for one in found] == points
     assert [one.parameters for one in found] == [
         k * (3 * 2 + 2) + k * (3 + 1) + (3 + 1) * k for k in (1, 1, 1, 3, 3, 3)
     ]
@@ -178,24 +164,18 @@ def test_demonstrations_are_read_with_what_any_candidate_sees(tmp_path):
     assert [[o.key for o in one.spec.observations] for one in candidates(spec, SIZE)] == [["place"], ["turn"]]
 
 
+EMPTY = "selection.grid: is empty; name what to try, such as selection.grid: {hierarchy.levels.0.count: .*}"
+OF_DATA = {"demonstrations.count": [3], "training.epochs": [1]}
+MISSPELT = [r"selection.grid: observations=\['palce'\]: .*no palce.*", r"selection.grid: .*no tern.*"]
+
+
 @pytest.mark.parametrize(
     ("grid", "problems"),
     [
-        (
-            {},
-            [
-                "selection.grid: is empty; name what to try, such as selection.grid: {hierarchy.levels.0.count: .*}"
-            ],
-        ),
+        ({}, [EMPTY]),
         ({"task": ["needle"]}, ["selection.grid.task: candidates are compared on the same data; remove it"]),
-        (
-            {"demonstrations.count": [3], "training.epochs": [1]},
-            ["selection.grid.demonstrations.count: candidates .*"],
-        ),
-        (
-            {"observations": [["place"], ["palce"], ["tern"]]},
-            [r"selection.grid: observations=\['palce'\]: .*no palce.*", r"selection.grid: .*no tern.*"],
-        ),
+        (OF_DATA, ["selection.grid.demonstrations.count: candidates .*"]),
+        ({"observations": [["place"], ["palce"], ["tern"]]}, MISSPELT),
     ],
 )
 def test_what_is_refused_has_a_line_each(grid, problems):
@@ -213,9 +193,8 @@ def test_what_is_refused_has_a_line_each(grid, problems):
 def test_folds_are_an_even_partition(data):
     count = data.draw(st.integers(4, 60))
     folds, seed = data.draw(st.integers(2, count)), data.draw(st.integers(0, 2**32 - 1))
-    tasks = data.draw(
-        st.lists(st.sampled_from("abc"), min_size=count, max_size=count) | st.just([""] * count)
-    )
+    several = st.lists(st.sampled_from("abc"), min_size=count, max_size=count)
+    tasks = data.draw(several | st.just([""] * count))
     found = assign(tasks, folds, seed)
     assert sorted(row for rows in found for row in rows) == list(range(count))
     assert {len(rows) for rows in found} <= {count // folds, -(-count // folds)}
@@ -241,9 +220,7 @@ def test_too_few_demonstrations_are_refused(count, folds, message):
 def test_what_its_author_set_apart_is_in_no_fold():
     demos = two_skills(10)
     marked = Demonstrations(demos.demonstrations, {"valid": ("demo_3", "demo_7")})
-    held_out, used = (
-        [fold.masks["valid"] for fold in divide(marked, 4, 0)],
-        {*demos.names} - {"demo_3", "demo_7"},
-    )
+    held_out = [fold.masks["valid"] for fold in divide(marked, 4, 0)]
+    used = {*demos.names} - {"demo_3", "demo_7"}
     assert sorted(name for names in held_out for name in names) == sorted(used)
     assert all({*fold.masks["train"]} == used - {*fold.masks["valid"]} for fold in divide(marked, 4, 0))

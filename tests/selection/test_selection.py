@@ -1,4 +1,4 @@
-"""A whole selection: scores against fits by hand, nothing done twice, and the same result however it was run."""
+"""A whole selection: scores against fits by hand, nothing done twice, and one result however it was run."""
 
 import json
 from xml.etree import ElementTree
@@ -37,9 +37,8 @@ def test_a_score_is_that_of_a_fit_without_the_fold(finished):
         rest = demos.select([name for name in demos.names if name not in names])
         trained = train_model(row.candidate.spec, Dimensions.of(demos), rest)
         expected = Fit(row.candidate.spec, trained.hierarchy).log_likelihood(demos.select(names))
-        np.testing.assert_array_equal(
-            [demo.log_likelihood for demo in scores[row.candidate.number, 2].valid], expected
-        )
+        found = [demo.log_likelihood for demo in scores[row.candidate.number, 2].valid]
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_every_candidate_has_the_same_folds(finished):
@@ -48,9 +47,8 @@ def test_every_candidate_has_the_same_folds(finished):
     assert set(scores) == {(c, f) for c in range(2) for f in range(3)}
     for (_, fold), one in scores.items():
         assert tuple(demo.name for demo in one.valid) == tuple(made.held_out[fold])
-        assert [demo.steps for demo in one.valid] == [
-            len(demo) for demo in two_skills().select(made.held_out[fold])
-        ]
+        lengths = [len(demo) for demo in two_skills().select(made.held_out[fold])]
+        assert [demo.steps for demo in one.valid] == lengths
     assert told.begun == [("cross-validation", 6, 0)]
     assert {pair[0] for pair in told.pairs} == {
         f"{row.candidate.name}, fold {f}" for row in made.choice.rows for f in range(3)
@@ -109,7 +107,10 @@ def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
 def test_where_nothing_is_left_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
     spec = spec_at(tmp_path, grid={"hierarchy.levels.0.count": [2]}, folds=2)
     monkeypatch.setattr(selection, "fit_beside", lambda *_, **__: 1 / 0)
-    said = "every candidate has failed in some fold; the first reason: unexpected ZeroDivisionError: division by zero"
+    said = (
+        "every candidate has failed in some fold; the first reason: unexpected ZeroDivisionError: division "
+    )
+    said += "by zero"
     with pytest.raises(Failed, match=said):
         select(spec, tmp_path / "run", Told(), ONE)
     assert json.loads((tmp_path / "run" / "selection.json").read_text())["chosen"] is None

@@ -20,7 +20,7 @@ SLOW = 30
 
 
 def skills_within_which_speed_varies(number=5, steps=100, seed=0, long=SLOW):
-    """Skills of about ``long`` steps, each a direction; the speed along it changes every three or four steps."""
+    """Skills of about ``long`` steps, each a direction; the speed along it changes every 3 or 4 steps."""
     random = np.random.default_rng(seed)
     found = []
     for _ in range(number):
@@ -48,13 +48,11 @@ def test_options_last_as_long_as_is_asked(long):
     assert segments_of(ddco_pyro.fit(SPEC, demos).segment(demos)[0]).median < 6  # the speed
     found = lasting(SPEC, demos, long)
     assert long / 1.5 < found.segments.median < 1.5 * long
-    fit = ddco_pyro.fit(
-        with_overrides(SPEC, overrides(SPEC, found.power, found.constant, found.window)), demos
-    )
+    changes = overrides(SPEC, found.power, found.constant, found.window)
+    fit = ddco_pyro.fit(with_overrides(SPEC, changes), demos)
     options = np.concatenate(fit.segment(demos)[0])
-    assert (
-        normalized_mutual_info_score(np.concatenate([demo.labels["skill"] for demo in demos]), options) > 0.7
-    )
+    skills = np.concatenate([demo.labels["skill"] for demo in demos])
+    assert normalized_mutual_info_score(skills, options) > 0.7
 
 
 def test_long_options_are_found_where_no_length_is_asked():
@@ -63,12 +61,8 @@ def test_long_options_are_found_where_no_length_is_asked():
 
 
 def test_lengths_are_seconds_or_steps():
-    for length, frequency, steps in (
-        ("2s", 10.0, 20.0),
-        ("20", 10.0, 20.0),
-        ("20", None, 20.0),
-        ("0.5s", 30.0, 15.0),
-    ):
+    whole = [("20", 10.0, 20.0), ("20", None, 20.0)]
+    for length, frequency, steps in [("2s", 10.0, 20.0), *whole, ("0.5s", 30.0, 15.0)]:
         assert in_steps("--segment", length, frequency) == steps
     for length, frequency, says in (
         ("2s", None, "do not say how many"),
@@ -91,13 +85,11 @@ def test_init_writes_what_it_found(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "median segment 21 steps in small fits; asked: 20 steps" in ended.out
     written = load_spec(spec)
     assert (written.control.power, written.training.window) == (0.3, 7)
-    assert (
-        written.hierarchy.levels[0].termination.network == written.hierarchy.meta_policy.network == "constant"
-    )
+    gates = (written.hierarchy.levels[0].termination, written.hierarchy.meta_policy)
+    assert [gate.network for gate in gates] == ["constant", "constant"]
     assert [(part.kind, part.dims) for part in written.control.parts] == [("student", (1, 2))]
-    refused(
-        "exclude each other", "init", file, "--out", spec, "--force", "--segments", "5", "--segment", "3s"
-    )
+    both = ("--segments", "5", "--segment", "3s")
+    refused("exclude each other", "init", file, "--out", spec, "--force", *both)
 
 
 def test_heavy_tails_are_found_where_they_predict_better():
@@ -119,10 +111,11 @@ def reaching(other, absolute, random):
     return seen, np.vstack([hand[1:], hand[-1:]]) if absolute else np.vstack([steps[1:], 0 * steps[:1]])
 
 
+OTHERS = {"late": lambda time: np.maximum(time - 0.7, 0), "belt": lambda time: time}
+
+
 @pytest.mark.parametrize("absolute", [False, True], ids=["velocities", "targets"])
-@pytest.mark.parametrize(
-    "other", [lambda time: np.maximum(time - 0.7, 0), lambda time: time], ids=["late", "belt"]
-)
+@pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS)
 def test_the_hand_is_drawn_where_something_else_moves_further(other, absolute):
     random = np.random.default_rng(0)
     assert moved(numbered(reaching(other, absolute, random) for _ in range(10))) == "palm"
@@ -130,12 +123,11 @@ def test_the_hand_is_drawn_where_something_else_moves_further(other, absolute):
 
 @pytest.mark.parametrize(("more", "drawn"), [({}, ""), ({"hand": 2}, "hand"), ({"hand": 2, "arm": 3}, "arm")])
 def test_a_plane_is_drawn_where_nothing_moves_in_space(more, drawn):
-    """A goal does not move, a sine and a cosine are no place, and two fingers of a gripper none beside an arm."""
+    """A goal does not move, a sine and a cosine are no place, nor are fingers of a gripper beside an arm."""
     rng, rows = np.random.default_rng(0), []
     for _ in range(4):
         control, turn = rng.normal(size=(30, 3)), np.cumsum(0.1 * rng.random(30))[:, None]
         seen = {key: np.cumsum(control[:, :size], 0) for key, size in more.items()}
-        rows.append(
-            ({"angle": np.hstack([np.sin(turn), np.cos(turn)]), "goal": np.ones((30, 3)), **seen}, control)
-        )
+        still = {"angle": np.hstack([np.sin(turn), np.cos(turn)]), "goal": np.ones((30, 3))}
+        rows.append((still | seen, control))
     assert moved(numbered(rows)) == drawn

@@ -53,9 +53,8 @@ def spec_of(*observations, **parts):
 
 def test_an_episode_is_drawn_where_its_pictures_are_observed():
     """The pictures are those of the states before each control, and all else is as without them."""
-    seen, blind = (
-        run_episode(watched, "supervisor", 3, observed=names).record for names in (["camera"], ["offsets"])
-    )
+    runs = (run_episode(watched, "supervisor", 3, observed=names) for names in (["camera"], ["offsets"]))
+    seen, blind = (run.record for run in runs)
     assert list(range(len(seen) + 1)) == DRAWN
     assert seen.observations.keys() - blind.observations.keys() == {"camera"}
     np.testing.assert_array_equal(seen.actions, blind.actions)
@@ -78,17 +77,15 @@ def test_an_encoder_stands_in_for_the_pictures():
         run_episode(one, "supervisor", 3, observed=[name]).record
         for one, name in ((watched, "camera"), (coded, "colour"))
     )
-    np.testing.assert_array_equal(
-        told.observations["colour"], [*map(brightness, seen.observations["camera"])]
-    )
+    expected = [*map(brightness, seen.observations["camera"])]
+    np.testing.assert_array_equal(told.observations["colour"], expected)
     policy = spec_of("colour")
     size = Dimensions({"colour": (3,)}, seen.actions.shape[1], len(seen))
     hierarchy = build_hierarchy(policy, size)
     controller = Controller(hierarchy, policy.rollout.control, policy.rollout.options)
     played = run_episode(coded, controller, 3, observed=hierarchy.encoder.shapes, keep=["colour"])
-    np.testing.assert_array_equal(
-        played.record.observations["colour"][0], brightness(seen.observations["camera"][0])
-    )
+    expected = brightness(seen.observations["camera"][0])
+    np.testing.assert_array_equal(played.record.observations["colour"][0], expected)
 
 
 def test_another_encoder_has_another_file():

@@ -86,7 +86,7 @@ def test_changed_sources_have_another_file(tmp_path):
 
 @pytest.mark.parametrize("package", ["mujoco", "dm-control", "toy-task"])
 def test_another_version_of_a_simulator_or_of_the_tasks_package_has_another_file(monkeypatch, package):
-    """The toy task is registered by the package ``toy-task``; one that is named by its module has no package."""
+    """The toy task is registered by the package ``toy-task``; one named by its module has no package."""
     registered, named = cache_path(toy_task.task, "toy", SPEC), cache_path(toy_task.task, TASK, SPEC)
     version = importlib.metadata.version
     other = lambda name: version(name) + ".other" * (name == package)  # noqa: E731
@@ -123,10 +123,8 @@ def path(tmp_path):
 
 
 def test_dimensions_come_from_the_file(path):
-    for given in (
-        spec(demonstrations={"path": str(path)}),
-        spec(task=None, demonstrations={"path": str(path)}),
-    ):
+    of_file = {"demonstrations": {"path": str(path)}}
+    for given in (spec(**of_file), spec(task=None, **of_file)):
         assert dimensions(given) == Dimensions({"offsets": (7,)}, 3, 9)
 
 
@@ -156,9 +154,8 @@ def test_demonstrations_can_be_left_out(path):
     left = spec(demonstrations={"path": str(path), "exclude": ["demo_4"]})
     found = demonstrations(left)
     assert (found.names, dict(found.masks)) == (("demo_9",), {"valid": ("demo_9",)})
-    with pytest.raises(
-        DemonstrationsError, match=r"demo_4: actions is nan at step 2, index \[0\]; repair it, or"
-    ):
+    says = r"demo_4: actions is nan at step 2, index \[0\]; repair it, or"
+    with pytest.raises(DemonstrationsError, match=says):
         demonstrations(spec(demonstrations={"path": str(path)}))
 
 
@@ -179,10 +176,8 @@ def test_demonstrations_are_collected_where_there_is_no_file_yet(tmp_path):
     path, told = tmp_path / "later.hdf5", []
     given = spec(demonstrations={"path": str(path), "count": 3, "labels": "phase"})
     found = demonstrations(given, told.append)
-    assert (found.names, told[-1]) == (
-        ("demo_0", "demo_1", "demo_2"),
-        Counted("collecting demonstrations", 3, done=3),
-    )
+    assert found.names == ("demo_0", "demo_1", "demo_2")
+    assert told[-1] == Counted("collecting demonstrations", 3, done=3)
     assert (set(found[0].observations), set(found[0].labels)) == ({"offsets"}, {"phase"})
     assert path.exists()
 
@@ -197,6 +192,8 @@ def test_demonstrations_may_come_from_another_task(tmp_path):
 
 LEVEL = {"count": 2, "policy": {"network": "linear"}}
 CONV = {"network": "conv"}
+ABOVE = LEVEL | {"name": "task", "termination": CONV}
+ONE_NUMBER = {"observations": ["visited"], "report": {"trajectory": "visited"}}
 
 
 def own(options):
@@ -209,19 +206,16 @@ def own(options):
     [
         (
             {"observations": ["offsets", "pose", "jaw"]},
-            r"^observations: there is no pose, jaw \(there are: camera, of",
+            r"^observations: there is no pose, jaw \(there are: ca",
         ),
-        (
-            {"observations": ["visited"], "report": {"trajectory": "visited"}},
-            r"^report\.trajectory: 'visited' is 1",
-        ),
+        (ONE_NUMBER, r"^report\.trajectory: 'visited' is 1"),
         (
             {"report": {"trajectory": ["offsets", "3:9"]}},
-            r"^report\.trajectory: 'offsets\[3:9\]' is 1 numbers, of",
+            r"^report\.trajectory: 'offsets\[3:9\]' is 1 numbers",
         ),
         (
             {"report": {"trajectory": ["offsets", "0:4"]}},
-            r"^report\.trajectory: 'offsets\[0:4\]' is 4 numbers, of",
+            r"^report\.trajectory: 'offsets\[0:4\]' is 4 numbers",
         ),
         (
             {"report": {"trajectory": [["offsets", "0:3"], ["offsets", "2:4"]]}},
@@ -229,10 +223,7 @@ def own(options):
         ),
         ({"observations": ["camera"]}, r"^baseline\.policy: reads vectors, but camera are images"),
         (
-            {
-                "baseline": None,
-                "hierarchy": {"levels": [LEVEL, LEVEL | {"name": "task", "termination": CONV}]},
-            },
+            {"baseline": None, "hierarchy": {"levels": [LEVEL, ABOVE]}},
             r"^hierarchy\.levels\.1\.termination: needs an image",
         ),
         (
@@ -257,22 +248,19 @@ def test_a_spec_that_does_not_fit_says_where(changes, message):
         build_hierarchy(spec(**changes), SIZE)
 
 
+HIDDEN = "hierarchy.levels.0.policy.hidden"
+UNCOUNTED = "the networks have more parameters than a machine can count"
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (
-            {"hierarchy.levels.0.policy.hidden": [10**6, 10**6]},
-            r"the networks have \d+ parameters, more than 50000000",
-        ),
-        (
-            {"hierarchy.levels.0.policy.hidden": [10**30]},
-            "the networks have more parameters than a machine can count",
-        ),
+        ({HIDDEN: [10**6, 10**6]}, r"the networks have \d+ parameters, more than 50000000"),
+        ({HIDDEN: [10**30]}, UNCOUNTED),
         ({"hierarchy.levels.0.count": 10**9}, "the levels have 1000000001 joint choices, at most 10000"),
     ],
 )
 def test_a_model_that_fills_the_memory_is_refused_before_it_is_made(toy_spec, overrides, message):
+    spec, size = with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12)
     with pytest.raises(SpecError, match=message):
-        check_networks(
-            with_overrides(toy_spec, overrides), Dimensions({"offsets": (4,), "visited": (1,)}, 2, 12)
-        )
+        check_networks(spec, size)

@@ -36,13 +36,13 @@ def test_a_registered_task_whose_packages_are_missing_is_one_line(monkeypatch):
         find_task("needs")
 
 
+NO_MODULE = "^task 'no_such_module:task' cannot be loaded: No module named 'no_such_module'$"
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (
-            "no_such_module:task",
-            "^task 'no_such_module:task' cannot be loaded: No module named 'no_such_module'$",
-        ),
+        ("no_such_module:task", NO_MODULE),
         ("toy_task:missing", "^task 'toy_task:missing' cannot be loaded: .*has no attribute 'missing'$"),
         (":task", "^task ':task' cannot be loaded: invalid format: ':task'$"),
         ("toy_task:SPEC", r"leads to a str, not to a ddco_pyro\.simulation\.task\.Task$"),
@@ -57,24 +57,16 @@ def with_outcome(outcome, **measures):
     return replace(toy_task.task, outcome=lambda environment: outcome, measures=measures)
 
 
+RATE = "and a rate is 0 or 1 in every episode; make it a"
+OTHERS = r"its outcome has success, topples, and its measures are success, topple; declare all of them"
+
+
 @pytest.mark.parametrize(
     ("outcome", "measures", "message"),
     [
-        (
-            {"success": 0.5},
-            {},
-            r"^task 'toy': success is 0\.5, and a rate is 0 or 1 in every episode; make it a",
-        ),
-        (
-            {"done": 2.0},
-            {"done": "rate"},
-            r"^task 'toy': done is 2, and a rate is 0 or 1 in every episode; make it a",
-        ),
-        (
-            {"success": 1.0, "topples": 2.0},
-            {"success": "rate", "topple": "mean"},
-            r"^task 'toy': its outcome has success, topples, and its measures are success, topple; declare all of them",
-        ),
+        ({"success": 0.5}, {}, rf"^task 'toy': success is 0\.5, {RATE}"),
+        ({"done": 2.0}, {"done": "rate"}, f"^task 'toy': done is 2, {RATE}"),
+        ({"success": 1.0, "topples": 2.0}, {"success": "rate", "topple": "mean"}, f"^task 'toy': {OTHERS}"),
     ],
 )
 def test_an_outcome_that_is_not_what_was_declared_is_refused(outcome, measures, message):
@@ -85,18 +77,12 @@ def test_an_outcome_that_is_not_what_was_declared_is_refused(outcome, measures, 
         run_episode(task, "supervisor", 0)
 
 
+NO_MEAN = "task 'toy': success is a rate, by which methods are compared; call the mean otherwise"
+NO_COUNT = "task 'toy': topples is declared a 'count'; it has to be a 'rate' or a 'mean'"
+
+
 @pytest.mark.parametrize(
-    ("measures", "message"),
-    [
-        (
-            {"success": "mean"},
-            "task 'toy': success is a rate, by which methods are compared; call the mean otherwise",
-        ),
-        (
-            {"topples": "count"},
-            "task 'toy': topples is declared a 'count'; it has to be a 'rate' or a 'mean'",
-        ),
-    ],
+    ("measures", "message"), [({"success": "mean"}, NO_MEAN), ({"topples": "count"}, NO_COUNT)]
 )
 def test_a_wrong_declaration_is_refused(measures, message):
     with pytest.raises(BadInput) as caught:
@@ -185,10 +171,9 @@ def test_an_episode_that_runs_out_of_time_is_no_success():
 def test_frames_need_a_render_mode():
     filmed = Task.from_gymnasium("ddco-test/Line-v0", {"supervisor": Towards}, render_mode="rgb_array")
     assert run_episode(filmed, "supervisor", 0, film=True).frames[0].shape == (8, 8, 3)
+    line = Task.from_gymnasium("ddco-test/Line-v0", {"supervisor": Towards})
     with pytest.raises(BadInput, match="render_mode='rgb_array'"):
-        run_episode(
-            Task.from_gymnasium("ddco-test/Line-v0", {"supervisor": Towards}), "supervisor", 0, film=True
-        )
+        run_episode(line, "supervisor", 0, film=True)
 
 
 def test_what_cannot_be_a_task_is_refused():

@@ -1,4 +1,4 @@
-"""Every setting is used by a spec, a study, a notebook, or what ``init`` writes, and there are at most so many."""
+"""Every setting is used by a spec, study, notebook, or what ``init`` writes; there are at most this many."""
 
 import re
 from collections.abc import Iterator
@@ -15,7 +15,9 @@ from ddco_pyro.spec.networks import SETTINGS, Network, UserNetworkSpec
 
 ROOT = Path(__file__).parents[2]
 MOST = 110
-"""104, and those of tasks and libraries: ``where``, ``minus``, ``library`` with ``run``, ``ridge`` and ``spread``."""
+"""104, and those of tasks and libraries: ``where``, ``minus``, ``library`` with ``run``, ``ridge`` and
+``spread``.
+"""
 
 
 def models_in(annotation: Any) -> Iterator[type[Model]]:
@@ -69,9 +71,8 @@ def said(data: Any, models: list[type[Model]]) -> Iterator[str]:
                 if key in known:
                     yield setting(model, key)
                     named = get_origin(known[key].annotation) is dict and isinstance(value, dict)
-                    yield from said(
-                        [*value.values()] if named else value, list(models_in(known[key].annotation))
-                    )
+                    inner = [*value.values()] if named else value
+                    yield from said(inner, list(models_in(known[key].annotation)))
 
 
 ELSEWHERE = {

@@ -71,30 +71,24 @@ def test_higher_levels_select_from_below_unless_told_otherwise() -> None:
     assert emits == [("control",), ("options",), ("options", "control")]
 
 
+OVER = {"network": "branches", "of": {"a": {"network": "conv"}}}
+
+
 @pytest.mark.parametrize(
     ("level", "read"),
     [
         ({}, ()),
         ({"policy": {"inputs": ["a", "b"]}, "termination": {"inputs": ["b", "c"]}}, ("a", "b")),
         ({"policy": {"network": "branches", "of": {"a": {}, "x": {"inputs": ["c", "a"]}}}}, ("a", "c")),
-        (
-            {
-                "policy": {
-                    "network": "lstm",
-                    "over": {"network": "branches", "of": {"a": {"network": "conv"}}},
-                }
-            },
-            ("a",),
-        ),
+        ({"policy": {"network": "lstm", "over": OVER}}, ("a",)),
         ({"policy": {"network": "lstm", "inputs": ["b"]}}, ("b",)),
     ],
 )
 def test_what_the_policies_of_a_level_read(level: dict[str, object], read: tuple[str, ...]) -> None:
     hierarchy = HierarchySpec.model_validate({"levels": [{"count": 2, **level}]})
     assert hierarchy.read_by(1) == read
-    assert HierarchySpec.model_validate({"levels": [{"count": 2}], "trunk": {"inputs": ["c"]}}).read_by(
-        1
-    ) == ("c",)
+    trunk = HierarchySpec.model_validate({"levels": [{"count": 2}], "trunk": {"inputs": ["c"]}})
+    assert trunk.read_by(1) == ("c",)
 
 
 # --- files --------------------------------------------------------------------------------------------------
@@ -103,15 +97,15 @@ def test_what_the_policies_of_a_level_read(level: dict[str, object], read: tuple
 DEEP = "not valid YAML: nested too deeply"
 
 
+UNCLOSED = "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "holds null, not a mapping (key: value), as a spec is"),
         ("- a\n- b\n", "holds ['a', 'b'], not a mapping (key: value), as a spec is"),
-        (
-            "seed: 1\ntask: [a\n",
-            "line 3, column 1: not valid YAML: expected ',' or ']', but got '<stream end>'",
-        ),
+        ("seed: 1\ntask: [a\n", UNCLOSED),
         ("seed: 1\ntask: a\nseed: 2\n", "line 3, column 1: not valid YAML: key 'seed' is given twice"),
         ("a: *b\n", "line 1, column 4: not valid YAML: found undefined alias 'b'"),
         pytest.param("[" * 1000, DEEP, id="opened"),
@@ -134,11 +128,8 @@ def test_files_that_hold_no_spec(tmp_path: Path, text: str | bytes, message: str
 
 
 def test_overrides_are_applied_to_the_file(tmp_path: Path) -> None:
-    overrides = [
-        "hierarchy.levels.0.count=3",
-        "training.optimizer.lr=1e-2",
-        "observations.1.differences=true",
-    ]
+    overrides = ["hierarchy.levels.0.count=3", "training.optimizer.lr=1e-2"]
+    overrides.append("observations.1.differences=true")
     spec = load_spec(write(tmp_path, EXAMPLE), [*overrides, "rollout={episodes: 2, policies: [open_loop]}"])
     assert spec.hierarchy.levels[0].count == 3
     assert spec.training.optimizer.lr == 0.01
@@ -163,9 +154,8 @@ def test_overrides_that_cannot_be_applied(tmp_path: Path, override: str, message
 def test_with_overrides_leaves_the_original_alone(tmp_path: Path) -> None:
     spec = load_spec(write(tmp_path, EXAMPLE))
     before = dump_spec(spec)
-    other = with_overrides(
-        spec, {"hierarchy.levels.0.count": 2, "selection.grid.hierarchy.levels.0.count": [2, 3]}
-    )
+    changes = {"hierarchy.levels.0.count": 2, "selection.grid.hierarchy.levels.0.count": [2, 3]}
+    other = with_overrides(spec, changes)
     assert other.hierarchy.levels[0].count == 2
     assert other.selection.grid == {"hierarchy.levels.0.count": (2, 3)}
     assert dump_spec(spec) == before
@@ -231,19 +221,15 @@ def test_all_defaults_are_written() -> None:
     assert set(written) == set(Spec.model_fields)
 
 
-WRONG_NETWORKS = (
-    {"network": "mpl"},
-    {"hidden": [0]},
-    {"hiden": [3]},
-    {"dropout": 1},
-    {"network": "conv", "layers": []},
-)
+NO_LAYERS = {"network": "conv", "layers": []}
+WRONG_NETWORKS = ({"network": "mpl"}, {"hidden": [0]}, {"hiden": [3]}, {"dropout": 1}, NO_LAYERS)
 WRONG = [{"hierarchy.levels.0.policy": network} for network in WRONG_NETWORKS]
 
 
-@pytest.mark.parametrize(
-    "values", [*WRONG, {"hierarchy.levels.0.count": 0}, {"observation": ["pose"]}], ids=str
-)
+OTHERS = [{"hierarchy.levels.0.count": 0}, {"observation": ["pose"]}]
+
+
+@pytest.mark.parametrize("values", [*WRONG, *OTHERS], ids=str)
 def test_the_schema_refuses_what_is_refused(values: dict[str, Any]) -> None:
     VALIDATOR.validate(SMALL)
     wrong = edited(SMALL, values)
@@ -272,55 +258,31 @@ def refusal(overrides: dict[str, Any]) -> str:
 OF_STATE = {"learn": True, "per_state": True}
 TWO_LEVELS = [{"count": 2}, {"name": "above", "count": 2, "policy": {"emits": ["control"]}}]
 SEGMENTS = {"training.layerwise": "segments"}
+LEVEL, META, TRUNK = "hierarchy.levels.0", "hierarchy.meta_policy", "hierarchy.trunk"
+LABELS, TRAJECTORY, STD = "training.labels", "report.trajectory", "control.std"
+HELD_OUT_TWICE = {"path": "a", "hold_out_by": "b", "valid_fraction": 0}
+JAW, DIFFERENCES = {"name": "jaw", "dims": [0]}, {"key": "step", "differences": True}
+ENDLESS = {"training.epochs": None, "training.patience": None}
+OF_FLAT = {"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]}
 REFUSED: list[tuple[dict[str, Any], str]] = [
     (
         {"compare_with": [{"kind": "per_timestep", "policy": {"network": "lstm"}}]},
         "compare_with.0.policy.network: per_",
     ),
     ({"hierarchy.levels.0.count": "5"}, "hierarchy.levels.0.count: must be a whole number, got '5'"),
-    (
-        {"hierarchy.levels.0.cuont": 5},
-        "hierarchy.levels.0.cuont: unknown key; did you mean hierarchy.levels.0.count?",
-    ),
+    ({f"{LEVEL}.cuont": 5}, f"{LEVEL}.cuont: unknown key; did you mean {LEVEL}.count?"),
     ({"inference": "exact"}, "inference: must be fused or enumerate"),
-    (
-        {"hierarchy.levels": [{"count": 1}, {"count": 2}]},
-        "hierarchy.levels.1.name: 'option' is also the name of",
-    ),
+    ({"hierarchy.levels": [{"count": 1}, {"count": 2}]}, "hierarchy.levels.1.name: 'option' is also the"),
     ({"hierarchy.levels.0.name": "a b"}, "hierarchy.levels.0.name: must be letters, digits, '_' or '-'"),
-    (
-        {"hierarchy.levels.0.policy.emits": ["options", "control"]},
-        "hierarchy.levels.0.policy.emits: the lowest level",
-    ),
-    (
-        {"hierarchy.meta_policy.emits": ["options", "options"]},
-        "hierarchy.meta_policy.emits: 'options' is given twice",
-    ),
+    ({f"{LEVEL}.policy.emits": ["options", "control"]}, f"{LEVEL}.policy.emits: the lowest level"),
+    ({f"{META}.emits": ["options", "options"]}, f"{META}.emits: 'options' is given twice"),
     ({"hierarchy.meta_policy.network": "mpl"}, "hierarchy.meta_policy.network: no network is called 'mpl'"),
-    (
-        {"demonstrations": {"path": "a", "hold_out_by": "b", "valid_fraction": 0}},
-        "demonstrations.hold_out_by: holds",
-    ),
-    (
-        {"hierarchy.trunk": {"network": "constant"}},
-        "hierarchy.trunk.network: a constant has no features for others",
-    ),
-    (
-        {"hierarchy.meta_policy": {"network": "constant", "inputs": ["a"]}},
-        "hierarchy.meta_policy.inputs: a constant",
-    ),
-    (
-        {"hierarchy.meta_policy": {"network": "linear", "hidden": [8]}},
-        "hierarchy.meta_policy.hidden: unknown key",
-    ),
-    (
-        {"control.parts": [{"name": "jaw", "dims": [0], "kind": "binary", "std": 1}]},
-        "control.parts.0.std: does",
-    ),
-    (
-        {"observations": ["state", {"key": "step", "differences": True}]},
-        "observations.1.differences: does not apply",
-    ),
+    ({"demonstrations": HELD_OUT_TWICE}, "demonstrations.hold_out_by: holds"),
+    ({TRUNK: {"network": "constant"}}, f"{TRUNK}.network: a constant has no features for others"),
+    ({META: {"network": "constant", "inputs": ["a"]}}, f"{META}.inputs: a constant"),
+    ({META: {"network": "linear", "hidden": [8]}}, f"{META}.hidden: unknown key"),
+    ({"control.parts": [{**JAW, "kind": "binary", "std": 1}]}, "control.parts.0.std: does"),
+    ({"observations": ["state", DIFFERENCES]}, "observations.1.differences: does not apply"),
     (
         {"hierarchy.trunk": {"network": "mlp"}, "hierarchy.levels.0.policy": {"network": "lstm"}},
         "hierarchy.levels.0.policy.network: reads the trunk: use one of linear, mlp, constant, got 'lstm'",
@@ -333,36 +295,19 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "compare_with.0.policy: flat_equal w",
     ),
     ({"hierarchy": None, "baseline": "flat_equal"}, "baseline: flat_equal takes its size from a hierarchy"),
-    (
-        {"training.epochs": None, "training.patience": None},
-        "training.epochs: epochs and training.patience are both",
-    ),
-    (
-        {"training.labels": {"level": "optoin", "from": "phase"}},
-        "training.labels.level: there is no level 'optoin'",
-    ),
-    (
-        {"training.labels": {"level": "option", "form": "phase"}},
-        "training.labels.from: missing; it has to be",
-    ),
+    (ENDLESS, "training.epochs: epochs and training.patience are both"),
+    ({LABELS: {"level": "optoin", "from": "phase"}}, f"{LABELS}.level: there is no level 'optoin'"),
+    ({LABELS: {"level": "option", "form": "phase"}}, f"{LABELS}.from: missing; it has to be"),
     (
         {"hierarchy.meta_policy.emits": ["control"], "training.labels": {"level": "option", "from": "phase"}},
-        "training.labels.level: no policy selects the options of 'option'; let the policies above emit options",
+        "training.labels.level: no policy selects the options of 'option'; let the policies above emit "
+        "option",
     ),
-    (
-        {"training.starts": ["clusters"]},
-        "training.starts.0: must be vq or vq_controls or windows or equal_parts",
-    ),
+    ({"training.starts": ["clusters"]}, "training.starts.0: must be vq or vq_controls or windows or equal_"),
     ({"task": None}, "task: missing; name a task, or give a file in demonstrations.path"),
     ({"observations": ["a", "a"]}, "observations.1.key: 'a' is given twice; keep one"),
-    (
-        {"observations": ["hand_pos", "goal"], "report.trajectory": "hand_po"},
-        "report.trajectory: there is no",
-    ),
-    (
-        {"report.trajectory": ["pose", "grip", 3]},
-        "report.trajectory: must be KEY or [KEY, slice], such as [pose, 3:6]",
-    ),
+    ({"observations": ["hand_pos", "goal"], TRAJECTORY: "hand_po"}, f"{TRAJECTORY}: there is no"),
+    ({TRAJECTORY: ["pose", "grip", 3]}, f"{TRAJECTORY}: must be KEY or [KEY, slice], such as [pose, 3:6]"),
     ({"report.trajectory": ["pose", "3-6"]}, "report.trajectory: there is no observation '3-6'"),
     ({"control.std": -0.1}, "control.std: must be a positive number or {learn: true}, got -0.1"),
     ({"training.optimizer.lr": float("inf")}, "training.optimizer.lr: must be a finite number, got inf"),
@@ -370,46 +315,23 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"seed": 2**32}, "seed: must be at most 4294967295, got 4294967296"),
     ({"model": 3}, "model: must be options, a baseline such as flat or mixture, a list of levels, or a"),
     ({"hierarchy": None, "baseline": "mixture"}, "baseline: mixture takes its experts from"),
-    (
-        {"hierarchy": None, "baseline": "flat", "compare_with": ["mixture"]},
-        "compare_with.0: mixture takes its experts",
-    ),
-    (
-        {"compare_with": [{"kind": "mixture", "policy": {}}]},
-        "compare_with.0.policy: a mixture has the networks of",
-    ),
-    (
-        {"hierarchy.levels.0.termination": "always", "compare_with": ["mixture"]},
-        "compare_with.0: the hierarchy is a",
-    ),
-    (
-        {"hierarchy.levels.0.termination": "alway"},
-        "hierarchy.levels.0.termination: must be a network, such as",
-    ),
-    (
-        {"control.std": {**OF_STATE, "per_option": True}},
-        "control.std.per_option: per_state gives each option its own",
-    ),
+    (OF_FLAT, "compare_with.0: mixture takes its experts"),
+    ({"compare_with": [{"kind": "mixture", "policy": {}}]}, "compare_with.0.policy: a mixture has the netw"),
+    ({f"{LEVEL}.termination": "always", "compare_with": ["mixture"]}, "compare_with.0: the hierarchy is a"),
+    ({f"{LEVEL}.termination": "alway"}, f"{LEVEL}.termination: must be a network, such as"),
+    ({STD: {**OF_STATE, "per_option": True}}, f"{STD}.per_option: per_state gives each option its own"),
     ({"hierarchy": None, "baseline": {"kind": "flat", "std": OF_STATE}}, "baseline.std: is for baselines in"),
     ({"compare_with": [{"kind": "flat", "std": OF_STATE}]}, "compare_with.0.std: no σ in control is learned"),
-    (
-        {"hierarchy.trunk": {}, "hierarchy.meta_policy": {"inputs": ["pose"]}},
-        "hierarchy.meta_policy.inputs: the trunk",
-    ),
-    (
-        {"hierarchy.levels": TWO_LEVELS, **SEGMENTS},
-        "hierarchy.levels.1.policy.emits: training.layerwise: segments",
-    ),
-    (
-        {"hierarchy.meta_policy.emits": ["control"], **SEGMENTS},
-        "hierarchy.meta_policy.emits: training.layerwise: segm",
-    ),
+    ({TRUNK: {}, META: {"inputs": ["pose"]}}, f"{META}.inputs: the trunk"),
+    ({"hierarchy.levels": TWO_LEVELS, **SEGMENTS}, "hierarchy.levels.1.policy.emits: training.layerwise: s"),
+    ({f"{META}.emits": ["control"], **SEGMENTS}, f"{META}.emits: training.layerwise: segm"),
 ]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"), REFUSED, ids=[message.partition(",")[0] for _, message in REFUSED]
-)
+IDS = [message.partition(",")[0] for _, message in REFUSED]
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=IDS)
 def test_refused_with_the_key_path_and_one_line(overrides: dict[str, Any], message: str) -> None:
     assert refusal(overrides).startswith(message)
 
@@ -434,23 +356,8 @@ def places(node: Any) -> Iterator[tuple[Any, Any]]:
             yield from places(node[key])
 
 
-ODD = (
-    None,
-    True,
-    -1,
-    10**40,
-    1e-320,
-    float("nan"),
-    "",
-    "x" * 9999,
-    "a:b:c",
-    "\0",
-    [],
-    [[]],
-    [None],
-    {},
-    {"a": {}},
-)
+ODD_NUMBERS = (None, True, -1, 10**40, 1e-320, float("nan"))
+ODD = (*ODD_NUMBERS, "", "x" * 9999, "a:b:c", "\0", [], [[]], [None], {}, {"a": {}})
 
 
 def test_an_odd_value_anywhere_is_read_or_refused_in_lines() -> None:
@@ -473,21 +380,19 @@ def test_an_odd_value_anywhere_is_read_or_refused_in_lines() -> None:
 LEVELS = "hierarchy.levels"
 
 
+NO_ITEM = "value 1: KEY: '1' is not the number of one of the 1 items there (the first is 0)"
+
+
 @pytest.mark.parametrize(
     ("key", "values", "message"),
     [
         (f"{LEVELS}.0.count", [1, 0], "value 0: KEY: must be at least 1, got 0"),
         (f"{LEVELS}.0.cuont", [1], f"value 1: KEY: unknown key; did you mean {LEVELS}.0.count?"),
-        (
-            f"{LEVELS}.1.count",
-            [1],
-            "value 1: KEY: '1' is not the number of one of the 1 items there (the first is 0)",
-        ),
+        (f"{LEVELS}.1.count", [1], NO_ITEM),
         ("selection.folds", [3], "the selection cannot be part of its own grid; remove it"),
         ("seed", 3, "must be a list, got 3"),
     ],
 )
 def test_every_value_of_a_grid_has_to_be_valid_in_place(key: str, values: object, message: str) -> None:
-    assert (
-        refusal({"selection.grid": {key: values}}) == f"selection.grid.{key}: {message.replace('KEY', key)}"
-    )
+    said = f"selection.grid.{key}: {message.replace('KEY', key)}"
+    assert refusal({"selection.grid": {key: values}}) == said

@@ -1,4 +1,4 @@
-"""User code (``module:name``) is imported only where that is allowed, and nothing is imported before that is known."""
+"""User code (``module:name``) is imported only where allowed, and nothing before that is known."""
 
 import shutil
 import subprocess
@@ -63,17 +63,15 @@ PLACES = [
 WORK = ["check", "collect", "fit", "select"]
 
 
-@pytest.mark.parametrize(
-    ("command", "override", "place"),
-    [*(("check", *one) for one in PLACES), *((command, *PLACES[2]) for command in WORK[1:])],
-    ids=lambda value: value,
-)
-def test_a_spec_that_names_code_is_refused(
-    spec: Path, imported: Path, command: str, override: str, place: str
-) -> None:
+CASES = [*(("check", *one) for one in PLACES), *((command, *PLACES[2]) for command in WORK[1:])]
+
+
+@pytest.mark.parametrize(("command", "override", "place"), CASES, ids=lambda value: value)
+def test_a_spec_that_names_code_is_refused(spec, imported: Path, command: str, override: str, place: str):
     name = TASK if place.endswith("task") else NETWORK
     before = sorted(imported.parent.iterdir())
-    said = f"{spec}: {place}: would import user code ({name}); pass --allow-code if you trust it (in Python: allow_code"
+    said = f"{spec}: {place}: would import user code ({name}); pass --allow-code if you trust it (in Python: "
+    said += "allow_code"
     assert refused(said, command, spec, *with_set(override)).out == ""
     assert sorted(imported.parent.iterdir()) == before
 
@@ -109,7 +107,8 @@ def test_a_run_that_names_code_is_refused(
     (run / "spec.yaml").write_text(yaml.safe_dump(with_overrides(toy_spec, {path: name}).model_dump()))
     before = sorted(imported.parent.rglob("*"))
     ended = call(*(one.replace("RUN", str(run)).replace("DEMOS", str(demos)) for one in command))
-    line = f"ddco-pyro: {run / 'spec.yaml'}: {path}: would import user code ({name}); pass --allow-code if you trust it"
+    line = f"ddco-pyro: {run / 'spec.yaml'}: {path}: would import user code ({name}); pass --allow-code if "
+    line += "you trust it"
     assert (ended.status, ended.out, ended.err.count("\n")) == (2, "", 1)
     assert ended.err.startswith(line)
     with pytest.raises(SpecError, match="would import user code"):
@@ -140,7 +139,7 @@ def test_what_is_built_in_or_registered_is_no_user_code(toy_spec: Any) -> None:
 
 @pytest.mark.slow
 def test_the_working_folder_is_searched_only_where_code_is_allowed(spec: Path, tmp_path: Path) -> None:
-    """Else what lies there could register itself, or stand in for an optional package that is not installed."""
+    """Else what lies there could register itself, or stand in for an optional package that is missing."""
     folder = tmp_path / "hostile"
     about = folder / "careless-1.0.dist-info"
     about.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The arena without Meta-World: episodes of an exported controller, what is recorded, and the phases of an expert."""
+"""The arena without Meta-World: episodes of an exported controller, what is recorded, an expert's phases."""
 
 import functools
 
@@ -17,7 +17,7 @@ from studies.arena_playing import exported, play
 
 
 class World:
-    """The state drifts with the control; success once its first number is above ``goal``, time is up after 30 steps."""
+    """The state drifts with the control; success once its first number is above ``goal``, up to 30 steps."""
 
     def __init__(self, goal):
         self.goal = goal
@@ -64,11 +64,8 @@ def test_an_exported_controller_plays_as_its_fit_does(fitted, runner, goal, succ
             expected.append(controller.act(observation))
             observation, done, ended = world.step(expected[-1])
         played = World(goal)
-        assert play(runner, played, seed) == {
-            "success": success,
-            "steps": len(expected),
-            "time": len(expected),
-        }
+        steps = len(expected)
+        assert play(runner, played, seed) == {"success": success, "steps": steps, "time": steps}
         assert (len(expected) < 30) == success
         np.testing.assert_allclose(played.received, expected, atol=1e-5)
 
@@ -93,16 +90,14 @@ def test_the_first_successes_are_recorded(tmp_path):
     arena_recording.collect(path, "toy", episode, 4, 1)
     with h5py.File(path) as file:
         assert [group.attrs["seed"] for group in file["data"].values()] == [0, 1, 3, 4]
-        assert (list(file["mask/valid"]), list(file["mask/train"])) == (
-            [b"demo_0"],
-            [b"demo_1", b"demo_2", b"demo_3"],
-        )
+        assert list(file["mask/valid"]) == [b"demo_0"]
+        assert list(file["mask/train"]) == [b"demo_1", b"demo_2", b"demo_3"]
         assert file["data/demo_2/dones"][()].tolist() == [False] * 6 + [True]
         assert file["data"].attrs["total"] == 4 + 5 + 7 + 8
 
 
 class Expert:
-    """Its methods are traced while it acts. Which of four return statements was reached is known from the value."""
+    """Its methods are traced while it acts. Which of four return statements was reached is in the value."""
 
     @staticmethod
     def _desired_pos(x):

@@ -100,13 +100,13 @@ def test_several_methods_and_counts_are_a_whole_table(rendered):
     )
 
 
+NO_NUMBER = "{hand.csv: one; goals; 11}: there is no such number; check its names"
+
+
 @pytest.mark.parametrize(
     ("template", "said"),
     [
-        (
-            "{hand.csv: one; goals; 11}",
-            "{hand.csv: one; goals; 11}: there is no such number; check its names",
-        ),
+        ("{hand.csv: one; goals; 11}", NO_NUMBER),
         ("{hand.csv: one}", "write a method or contrast, a measure and a number of demonstrations"),
         ("{hand.csv: one; goals; 10; show=all}", "After show= stands one of: interval, mean"),
         ("{none.csv: one; goals; 10}", "none.csv: cannot be read: No such file or directory"),
@@ -132,23 +132,14 @@ def test_verdicts_of_a_page_are_those_that_holm_leaves(rendered):
 
 def test_a_fixed_sequence_goes_on_beside_equivalence(rendered, tmp_path):
     """Differences of 3, 4, 5 and 4 with four demonstrations; with six of 0 and 1."""
-    first, last = (
-        {"contrast": "options - flat", "measure": "nats", "demonstrations": number} for number in (4, 6)
-    )
-    contrasts = [
-        {**first, "kind": "equivalence", "margin": 0.5},
-        first,
-        last,
-        {**first, "contrast": "flat - options"},
-    ]
+    nats = {"contrast": "options - flat", "measure": "nats"}
+    first, last = ({**nats, "demonstrations": number} for number in (4, 6))
+    equal = {**first, "kind": "equivalence", "margin": 0.5}
+    contrasts = [equal, first, last, {**first, "contrast": "flat - options"}]
     study = STUDY | {"contrasts": contrasts, "correction": "fixed_sequence"}
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(study))
-    values = {
-        ("options", 4): [3, 4, 5, 4],
-        ("options", 6): [0, 1, 0, 1],
-        ("flat", 4): [0] * 4,
-        ("flat", 6): [0] * 4,
-    }
+    values = {("options", 4): [3, 4, 5, 4], ("options", 6): [0, 1, 0, 1]}
+    values |= {("flat", number): [0] * 4 for number in (4, 6)}
     rows = [("study", "a", method, str(count), str(seed), "nats", value)
             for (method, count), own in values.items() for seed, value in enumerate(own)]  # fmt: skip
     pd.DataFrame(rows, columns=COLUMNS).to_csv(tmp_path / "table.csv", index=False)
@@ -188,10 +179,8 @@ def test_the_command_renders_checks_and_refuses_in_one_line(rendered, tmp_path, 
         return 0, capsys.readouterr().out
 
     status, said = run("render", "--check", path)
-    assert (status, said) == (
-        1,
-        f"{path}: differs from the results; write it with: python -m studies render {path}\n",
-    )
+    says = f"{path}: differs from the results; write it with: python -m studies render {path}\n"
+    assert (status, said) == (1, says)
     assert run("render", path) == run("render", "--check", path) == (0, "1 pages agree with the results\n")
     assert "| 4.00 [2.70, 5.30] |" in path.read_text()
     for words, text in (
@@ -239,7 +228,7 @@ RAW = re.compile(r"<!--|-->|\*\*|__\w|\]\(|`|^\s*\||\|\s*:?-{2,}|^#{1,6} |\{\w+\
 
 
 def raw(text):
-    """The raw Markdown and comments in a page as GitHub shows it, and the lines that would begin a raw line."""
+    """Raw Markdown and comments in a page as GitHub shows it, and the lines that would begin a raw line."""
     shown = []
     for block in MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(text):
         parts = [part for part in block.children or [block] if not part.type.startswith(("code", "fence"))]
@@ -262,7 +251,7 @@ def rows(table, **named):
 
 
 def difference(ours, theirs, form):
-    """A mean difference and its t interval, over seeds or, where there are several, over tasks or their families."""
+    """A mean difference and its t interval, over seeds or, of several, over tasks or their families."""
     paired = (ours - theirs).dropna()
     tasks = paired.groupby("task").mean()
     if len(tasks) > 1:
@@ -281,10 +270,8 @@ def of(table, *methods, **named):
 def test_numbers_of_readme_are_those_of_the_tables_by_pandas_alone():
     text = (ROOT / "README.md").read_text().replace("**", "")
     results, own, names = "docs/results/{}.csv".format, {"measure": "success"}, ("options", "flow", "lstm")
-    for named, study, count in (
-        ("six tasks of Meta-World", "peers", "10"),
-        ("a goal shown once", "hidden", "40"),
-    ):
+    shown = (("six tasks of Meta-World", "peers", "10"), ("a goal shown once", "hidden", "40"))
+    for named, study, count in shown:
         known = of(results(study), *names, study=study, demonstrations=count, **own)
         means = " | ".join(f"{one.groupby('task').mean().mean():.0%}" for one in known)
         assert f"| {named} | {count} | {means} |" in text
@@ -297,28 +284,17 @@ def test_numbers_of_readme_are_those_of_the_tables_by_pandas_alone():
     for named, count, known in (("a goal shown once", 40, (flat, mixture, options)), ("needle", 100, needle)):
         parts = [difference(known[n + 1], known[n], "+.0%") for n in range(2)]
         assert f"| {named} | {count} | success | {' | '.join(parts)} | 10 |" in text
+    by_em = {"study": "arena_em", "demonstrations": "50", "measure": "nmi"}
     for named, table, form, of_study in (
         ("27 tasks | 10 | success", "frozen", "+.0%", {"demonstrations": "10", **own}),
         ("26 tasks | 10 | success", "frozen_again", "+.0%", {"demonstrations": "10", **own}),
-        (
-            "9 tasks | 50 | NMI",
-            "arena_em",
-            "+.2f",
-            {"study": "arena_em", "demonstrations": "50", "measure": "nmi"},
-        ),
+        ("9 tasks | 50 | NMI", "arena_em", "+.2f", by_em),
     ):
         known = of(f"studies/{table}.csv", "options", "mixture", **of_study)
         assert f"{named} | – | {difference(*known, form)} | 3 |" in text
     people = {"study": "surgeon", "measure": "accuracy"}
     for named, task in (("knot tying", "Knot_Tying"), ("suturing", "Suturing")):
-        folds = of(
-            results("people"),
-            "options, 3 labelled",
-            "recogniser, transitions, 3 labelled",
-            task=task,
-            **people,
-        )
-        assert (
-            f"| {named}, right steps | {' | '.join(difference(one, 0 * one, '.2f') for one in folds)} |"
-            in text
-        )
+        methods = ("options, 3 labelled", "recogniser, transitions, 3 labelled")
+        folds = of(results("people"), *methods, task=task, **people)
+        parts = " | ".join(difference(one, 0 * one, ".2f") for one in folds)
+        assert f"| {named}, right steps | {parts} |" in text

@@ -132,7 +132,7 @@ class Told:
 
 
 def test_chunks_of_actions_are_averaged_over_what_was_given_for_a_step():
-    """By hand: step 2 was given 2 at time 0, 11 at time 1 and 20 at time 2; the oldest has the largest weight."""
+    """By hand: step 2 was given 2 at time 0, 11 at time 1 and 20 at time 2; the oldest weighs most."""
     chunks, weights = arena_playing.Chunks(Told(), 3), np.exp([0, -0.01, -0.02])
     given = [[0.0], [1.0, 10.0], [2.0, 11.0, 20.0], [12.0, 21.0, 30.0]]
     for _ in range(2):  # nothing is left of an episode
@@ -149,26 +149,23 @@ def test_a_part_of_a_chunk_is_executed_before_the_next_one():
 
 
 class Here:
-    """A simulator in this process: an episode sees the first demonstration and misses its controls by ``error``."""
+    """A simulator in this process: an episode sees the first demonstration, and misses it by ``error``."""
 
     def __init__(self, demo, folder):
         self.demo, self.folder = demo, folder
 
     def played(self, task, methods, first, episodes):
         methods["policy"].write(self.folder)
-        errors = [
-            np.abs(
-                acted(arena_playing.exported(self.folder), self.demo.observations, seed) - self.demo.actions
-            ).max()
-            for seed in range(first, first + episodes)
-        ]
-        return {
-            "episodes": {"policy": [{"error": error, "seed": first + n} for n, error in enumerate(errors)]}
-        }
+        errors = []
+        for seed in range(first, first + episodes):
+            found = acted(arena_playing.exported(self.folder), self.demo.observations, seed)
+            errors.append(np.abs(found - self.demo.actions).max())
+        each = [{"error": error, "seed": first + n} for n, error in enumerate(errors)]
+        return {"episodes": {"policy": each}}
 
 
 def test_a_world_trains_with_the_settings_of_a_cell_and_plays_what_it_wrote(tmp_path):
-    """Linear controls, which linear options with chunks as their control follow, as chunks of a perceptron do."""
+    """Linear controls, which linear options with chunks as control follow, as a perceptron's chunks do."""
     rng = np.random.default_rng(0)
     places = (np.cumsum(rng.normal(size=(20, 1)), 0) for _ in range(6))
     demos = demonstrations(*(({"x": x}, x * [[1.0, -2.0]]) for x in places))

@@ -150,15 +150,15 @@ def test_a_fixed_sequence_ends_where_a_contrast_does_not_hold(p_values, said):
     assert [p for _, p in judged] == largest
 
 
+HOLDS, UNCLEAR = "holds", "inconclusive"
+
+
 @pytest.mark.parametrize(
     ("p_values", "said"),
     [
-        (
-            [0.01, 0.9, 0.02, 0.001],
-            ["holds", "inconclusive", "holds", "holds"],
-        ),  # the last waits for its twin, 2
-        ([0.01, 0.01, 0.3, 0.99], ["holds", "holds", "inconclusive", "does not hold"]),
-        ([0.4, 0.01, 0.01, 0.01], ["inconclusive", "holds", "not reached", "not reached"]),
+        ([0.01, 0.9, 0.02, 0.001], [HOLDS, UNCLEAR, HOLDS, HOLDS]),  # the last waits for its twin, 2
+        ([0.01, 0.01, 0.3, 0.99], [HOLDS, HOLDS, UNCLEAR, "does not hold"]),
+        ([0.4, 0.01, 0.01, 0.01], [UNCLEAR, HOLDS, "not reached", "not reached"]),
     ],
 )
 def test_equivalence_is_read_off_the_interval_of_its_twin(p_values, said):

@@ -1,4 +1,4 @@
-"""Studies: refused declarations, cells that are kept, killed, moved and shared, worlds, and simulated people."""
+"""Studies: refused declarations, cells that are kept, killed, moved and shared, worlds, simulated people."""
 
 import functools
 import json
@@ -56,7 +56,7 @@ HERE = Workers(jobs=1)
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    """Demonstrations of a place that is left and then sought; two linear policies explain them, one does not."""
+    """Demonstrations of a place that is left and then sought; two linear policies explain them, not one."""
     turn, phase = np.repeat([[-2.0], [2.0]], 5, 0), np.repeat([0, 1], 5)
     path = tmp_path_factory.mktemp("file") / "mine.hdf5"
     places = np.random.default_rng(0).normal(size=(12, 10, 2))
@@ -86,18 +86,18 @@ def done(file):
     return folder
 
 
+SIX = {"count": 6}
 TUNED = {
     "choose": "nats",
     "seeds": {"test": {"count": 1}, "development": {"first": 7, "count": 1}},
-    "demonstrations": {
-        "counts": [3],
-        "held_out": 2,
-        "test": {"count": 6},
-        "development": {"first": 6, "count": 6},
-    },
+    "demonstrations": {"counts": [3], "held_out": 2, "test": SIX, "development": {"first": 6, **SIX}},
     "contrasts": [],
 }
 GRID, FLAT = {"options": {"grid": {"control.std": [0.1, 0.2]}}}, {"flat": {"baseline": "flat"}}
+SHARED, OVERLAPPING = {"first": 2, "count": 1}, {"first": 39, "count": 10}
+NATS = {"contrast": "options - flat", "measure": "nats"}
+EQUIVALENCE = {**STUDY["contrasts"][0], "kind": "equivalence"}
+OF_GRID = {"overrides": {"control.std": 0.2}}
 SAME = {"grid": {"control.std": [0.1, 0.1]}}
 RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
 
@@ -106,45 +106,21 @@ RECORDED = {"counts": [10], "held_out": 5, "test": {"first": 0, "count": 20}}
     ("changes", "said"),
     [
         ({"seed": {}}, "seed: unknown key; did you mean seeds?"),
-        (
-            {"seeds": {"test": {"count": 3}, "development": {"first": 2, "count": 1}}},
-            "seeds.development: 2 to 2 ",
-        ),
-        (
-            {"demonstrations": RECORDED, "starts": {"test": {"first": 39, "count": 10}}},
-            "starts.test: 39 to 58",
-        ),
+        ({"seeds": {"test": {"count": 3}, "development": SHARED}}, "seeds.development: 2 to 2 "),
+        ({"demonstrations": RECORDED, "starts": {"test": OVERLAPPING}}, "starts.test: 39 to 58"),
         ({"demonstrations": {**RECORDED, "test": {"count": 14}}}, "must be at least 15"),
         ({"measures": ["nat"]}, "there is no measure 'nat' (did you mean 'nats'?)"),
         ({"contrasts": [{"contrast": "options - flat", "measure": "nats"}]}, "must be one of 4, 6"),
-        (
-            {"contrasts": [{"contrast": "options - flat", "measure": "ari", "demonstrations": 6}]},
-            "not among measures",
-        ),
+        ({"contrasts": [{**NATS, "measure": "ari", "demonstrations": 6}]}, "not among measures"),
         ({"failed": {"success": 0.0}}, "failed.success: 'success' is not among measures"),
-        (
-            {"contrasts": [{**STUDY["contrasts"][0], "kind": "equivalence"}]},
-            "contrasts.0.margin: missing; say which",
-        ),
+        ({"contrasts": [EQUIVALENCE]}, "contrasts.0.margin: missing; say which"),
         ({"families": {"door": ["open", "close"]}}, "families: must have tasks of the study, each once"),
         ({"choose": "nats"}, "choose: goes together with seeds.development"),
         ({**TUNED, "methods": GRID | FLAT}, "unequal numbers of points to choose from (options 2, flat 1)"),
-        (
-            {**TUNED, "methods": {"options": SAME} | FLAT},
-            "methods: have nothing to choose from; give each a grid",
-        ),
-        (
-            {"methods": {"options": SAME | {"overrides": {"control.std": 0.2}}}},
-            "has 'control.std', which the grid has",
-        ),
-        (
-            {"methods": GRID, "contrasts": []},
-            "choose: missing; name the measure that chooses among the points",
-        ),
-        (
-            {"overrides": {"control.stdd": 0.1}},
-            "options: control.stdd: unknown key; did you mean control.std?",
-        ),
+        ({**TUNED, "methods": {"options": SAME} | FLAT}, "methods: have nothing to choose from; give each a"),
+        ({"methods": {"options": SAME | OF_GRID}}, "has 'control.std', which the grid has"),
+        ({"methods": GRID, "contrasts": []}, "choose: missing; name the measure that chooses among the poin"),
+        ({"overrides": {"control.stdd": 0.1}}, "options: control.stdd: unknown key; did you mean control.st"),
     ],
 )
 def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, said):
@@ -155,12 +131,14 @@ def test_a_declaration_that_cannot_be_meant_is_refused_in_words(made, changes, s
 
 def test_the_page_names_every_key():
     page = (ROOT / "docs" / "studies.md").read_text()
-    models = [
-        one for one in vars(declaration).values() if getattr(one, "__module__", "") == declaration.__name__
-    ]
+    own, known = declaration.__name__, vars(declaration).values()
+    models = [one for one in known if getattr(one, "__module__", "") == own]
     keys = {key for one in models for key in getattr(one, "model_fields", {})}
     assert "margin" in keys
     assert not {key for key in keys if f"`{key}`" not in page}
+
+
+NO_METHOD = {"world": "simulated:WORLD", "methods": {"on": {"by": "flo"}}, "contrasts": []}
 
 
 @pytest.mark.parametrize(
@@ -168,10 +146,7 @@ def test_the_page_names_every_key():
     [
         ({"kept": [{"table": "spec.yaml"}]}, "spec.yaml: is damaged"),
         ({"world": "nowhere:WORLD"}, "world: nowhere:WORLD cannot be loaded: No module named"),
-        (
-            {"world": "simulated:WORLD", "methods": {"on": {"by": "flo"}}, "contrasts": []},
-            "has no method 'flo' (did",
-        ),
+        (NO_METHOD, "has no method 'flo' (did"),
     ],
 )
 def test_worlds_and_tables_that_cannot_be_used_are_refused_before_any_work(made, changes, said):
@@ -204,9 +179,8 @@ def test_in_a_registered_task_every_training_seed_has_its_own_episodes(tmp_path)
     state = folder.run(HERE)
     assert not state.failed
     for seed, cell in enumerate(folder.cells("test")):
-        recorded = Demonstrations.read(
-            folder.path / "demonstrations" / f"toy_task-task-{10 + 8 * seed}-6.hdf5"
-        )
+        name = f"toy_task-task-{10 + 8 * seed}-6.hdf5"
+        recorded = Demonstrations.read(folder.path / "demonstrations" / name)
         assert recorded.names == tuple(f"demo_{n}" for n in range(10 + 8 * seed, 16 + 8 * seed))
         controller = load(folder.path / "work" / folder.key(cell) / "fit").controller()
         outcomes = [run_episode(toy_task.task, controller, 500 + 5 * seed + n).outcome for n in range(5)]
@@ -317,9 +291,8 @@ def test_planted_options_win_in_the_table_and_the_contrast(done):
     assert not state.missing
     said = report(done, state)
     rows = read_tidy(done.path / "table.csv")
-    assert (
-        len(rows[rows.measure.isin(["nats", "nmi"])]) == 2 * 2 * 2 + 2 * 2
-    )  # nats of both methods, nmi of options
+    # nats of both methods, nmi of options
+    assert len(rows[rows.measure.isin(["nats", "nmi"])]) == 2 * 2 * 2 + 2 * 2
     (contrast,) = statistics.tested(done.study, rows)
     nats = rows[(rows.measure == "nats") & (rows.demonstrations == "6")].set_index(["method", "seed"]).value
     by_hand = [nats["options", seed] - nats["flat", seed] for seed in "01"]
@@ -407,9 +380,8 @@ def test_a_failed_cell_counts_what_is_declared(made, monkeypatch, tmp_path):
     rows = read_tidy(folder.path / "table.csv")
     (contrast,) = statistics.tested(folder.study, rows)
     assert contrast.estimate.units == pytest.approx([own + 50 for own in options], rel=1e-8)
-    assert "failed, and count nats -50: unexpected ZeroDivisionError: division by zero (2)" in [
-        *told(folder, state)
-    ]
+    says = "failed, and count nats -50: unexpected ZeroDivisionError: division by zero (2)"
+    assert says in [*told(folder, state)]
     second = made(**SMALL, failed={"nats": -50.0}, kept=[{"table": "out/table.csv"}])
     elsewhere = Folder(second.study, tmp_path / "elsewhere")
     assert (len(elsewhere.state().done), len(elsewhere.state().failed)) == (2, 2)
@@ -448,20 +420,17 @@ def test_a_pinned_study_is_of_one_commit(made, monkeypatch, tmp_path):
     table = pd.read_csv(tmp_path / "table.csv", dtype=str)
     table.head(1).to_csv(tmp_path / "fewer.csv", index=False)
     fewer = Folder(pinned(kept=[{"table": "fewer.csv"}]).study, tmp_path / "fewer")
-    with pytest.raises(
-        BadInput, match="pinned: results are of commit 11aa, here is 22bb; run it at that commit, or"
-    ):
+    says = "pinned: results are of commit 11aa, here is 22bb; run it at that commit, or"
+    with pytest.raises(BadInput, match=says):
         fewer.run(HERE)
-    table.assign(code=np.where(table.seed == table.seed[0], "11aa", "22bb")).to_csv(
-        tmp_path / "mixed.csv", index=False
-    )
+    of_rows = np.where(table.seed == table.seed[0], "11aa", "22bb")
+    table.assign(code=of_rows).to_csv(tmp_path / "mixed.csv", index=False)
     mixed = Folder(pinned(kept=[{"table": "mixed.csv"}]).study, tmp_path / "mixed")
     assert "pinned: results are of commits 11aa, 22bb; keep those of one" in refused(mixed)
     with pytest.raises(BadInput, match="pinned: the code has changes since 11aa; commit them"):
         Folder(pinned().study, tmp_path / "third").run(HERE)
-    changed = Folder(
-        pinned(kept=kept, in_spec={"seed": 1}, overrides={"control.std": 0.4}).study, tmp_path / "fourth"
-    )
+    other = pinned(kept=kept, in_spec={"seed": 1}, overrides={"control.std": 0.4}).study
+    changed = Folder(other, tmp_path / "fourth")
     assert "was done with key" in refused(changed)
     table = pd.read_csv(tmp_path / "table.csv")
     table[statistics.COLUMNS].to_csv(tmp_path / "table.csv", index=False)
@@ -512,7 +481,7 @@ def test_the_commit_of_the_code_is_that_of_library_and_study(tmp_path, monkeypat
 
 
 def test_the_best_point_on_development_seeds_is_tested(made):
-    """With σ of 50 every method explains the demonstrations worse than with 0.5. Options have a grid of their own."""
+    """With σ of 50 every method explains demonstrations worse than with 0.5. Options have their own grid."""
     flat = {"baseline": "flat", "grid": {"control.std": [0.5, 50.0]}}
     methods = {"options": {"grid": {"control.std": [50.0, 0.5]}}, "flat": flat}
     folder = made(**TUNED, methods=methods)
@@ -523,11 +492,8 @@ def test_the_best_point_on_development_seeds_is_tested(made):
     assert tested == {("options", 0.5), ("flat", 0.5)}
     report(folder, state)
     rows = read_tidy(folder.path / "table.csv")
-    names = {
-        "options",
-        "flat",
-        *(f"{name} (std = {std})" for name in ("options", "flat") for std in (0.5, 50.0)),
-    }
+    points = {f"{name} (std = {std})" for name in ("options", "flat") for std in (0.5, 50.0)}
+    names = {"options", "flat", *points}
     assert {*rows.method} == names
     chosen = "the points with the highest nats in development: options (std = 0.5), flat (std = 0.5)"
     assert chosen in [*told(folder, state)]
@@ -542,16 +508,12 @@ def test_a_measure_of_nothing_is_better_than_less(made):
 
     def chosen(first):
         values = {(7, 0.5): first, (8, 0.5): 0.0, (7, 1.0): -0.4, (8, 1.0): -0.4}
-        done = {
-            one: cells.Done(values={"nats": values[one.seed, one.point["control.std"]]}) for one in places
-        }
+        nats = {one: values[one.seed, one.point["control.std"]] for one in places}
+        done = {one: cells.Done(values={"nats": value}) for one, value in nats.items()}
         return folder.chosen(cells.State(places, done, {}))["options"]["control.std"]
 
-    assert [chosen(first) for first in (-1.0, -0.7, None)] == [
-        1.0,
-        0.5,
-        1.0,
-    ]  # None: it applies to no episode
+    # None: it applies to no episode
+    assert [chosen(first) for first in (-1.0, -0.7, None)] == [1.0, 0.5, 1.0]
 
 
 def test_some_tasks_choose_for_all(made):

@@ -39,9 +39,8 @@ class Toy(Cell):
 
 def run(monkeypatch, tmp_path, words):
     """Run it with these words; what has been done so far."""
-    monkeypatch.setattr(
-        "sys.argv", ["toy.py", *words, "--runs", f"{tmp_path}/runs", "--out", f"{tmp_path}/toy.csv"]
-    )
+    places = ("--runs", f"{tmp_path}/runs", "--out", f"{tmp_path}/toy.csv")
+    monkeypatch.setattr("sys.argv", ["toy.py", *words, *places])
     parser = described("A toy.")
     parser.add_argument("--tasks", nargs="*", default=["a", "b"])
     study.main(

@@ -20,9 +20,8 @@ def killed(arguments: Sequence[object], folder: Path, cache: Path, seconds: floa
 
     :returns: whether it was killed, and had not ended before.
     """
-    own = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | {
-        "DDCO_PYRO_CACHE": str(cache)
-    }
+    own = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    own["DDCO_PYRO_CACHE"] = str(cache)
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
     process = subprocess.Popen([COMMAND, *map(str, arguments)], cwd=folder, env=own, **quiet)
     with contextlib.suppress(subprocess.TimeoutExpired):

@@ -13,14 +13,10 @@ EVERYTHING = ("levels.", "meta_policy.")
 CONSTANT = {"network": "constant"}
 LEARNED = {"learn": True, "floor": 0.01}
 CLIPPED = (ControlPart("arm", (0, 1), "clipped", (-0.8, -np.inf), (0.9, 1.0)),)
-MIXED = (
-    ControlPart("arm", (0,), "clipped", (-0.8,), (0.9,)),
-    ControlPart("jaw", (1,), "binary", (0.0,), (1.0,)),
-)
-ACTIONS = (
-    ControlPart("action", (0,), "categorical", values=(0.0, 1.0, 2.0)),
-    ControlPart("b", (1,), "gaussian"),
-)
+JAW = ControlPart("jaw", (1,), "binary", (0.0,), (1.0,))
+MIXED = (ControlPart("arm", (0,), "clipped", (-0.8,), (0.9,)), JAW)
+OF_VALUES = ControlPart("action", (0,), "categorical", values=(0.0, 1.0, 2.0))
+ACTIONS = (OF_VALUES, ControlPart("b", (1,), "gaussian"))
 STUDENT = (ControlPart("arm", (0, 1), "student"),)
 HURDLE = (ControlPart("stop", (0, 1), "hurdle", (-np.inf, -np.inf), (np.inf, np.inf), exact=(0.0, 0.0)),)
 

@@ -1,4 +1,4 @@
-"""Independent truth for the inference: every latent path of a small AHMM, one after another, in plain Python."""
+"""Independent truth for the inference: every latent path of a small AHMM, one by one, in plain Python."""
 
 import functools
 import itertools
@@ -33,9 +33,8 @@ def random_tables(
         if not hybrid[level]:
             logits[..., 0] = NEVER
         selection.append(logits.log_softmax(-1))
-        control.append(
-            2 * normal(caller) if hybrid[level] else torch.full((trajectories, steps, caller), NEVER)
-        )
+        never = torch.full((trajectories, steps, caller), NEVER)
+        control.append(2 * normal(caller) if hybrid[level] else never)
     logits = [normal(count) for count in counts]
     termination = [torch.stack([(-x).sigmoid().log(), x.sigmoid().log()], -1) for x in logits]
     return Tables(tuple(selection), tuple(termination), tuple(control if counts else [normal(1)]))
@@ -97,19 +96,18 @@ def brute_force(tables: Tables, n: int, length: int) -> Truth:
     return Truth(math.log(total), *([np.array(table) / total for table in part] for part in (u, v, w)))
 
 
-Path = tuple[tuple[int, ...], ...]
+Choices = tuple[int, ...]
+Path = tuple[Choices, ...]
 
 
 def paths(tables: Tables, n: int, length: int, sizes: list[int]) -> Iterator[tuple[Path, Path, float]]:
-    """Every possible (h, b) with its joint density; a step that follows another is looked up when it is seen again."""
+    """Every possible (h, b) with its joint density; a step that follows another is looked up from then on."""
     joint = list(itertools.product(*map(range, sizes)))
     ends = list(itertools.product((0, 1), repeat=len(sizes)))
     known = _lists(tables, n)
 
     @functools.cache
-    def following(
-        t: int, before: tuple[int, ...] | None
-    ) -> list[tuple[tuple[int, ...], tuple[int, ...], float]]:
+    def following(t: int, before: tuple[int, ...] | None) -> list[tuple[Choices, Choices, float]]:
         steps = ((h, b) for h in joint for b in (ends if t else [(1,) * len(sizes)]))
         return [(h, b, p) for h, b in steps if (p := _step(known, t, h, b, before)) > 0]
 
@@ -130,9 +128,7 @@ def _lists(tables: Tables, n: int) -> Tables:
     return Tables(*cut, power=tables.power)
 
 
-def _step(
-    tables: Tables, t: int, h: tuple[int, ...], b: tuple[int, ...], before: tuple[int, ...] | None
-) -> float:
+def _step(tables: Tables, t: int, h: Choices, b: Choices, before: Choices | None) -> float:
     probability = 1.0
     for d in range(len(h)):
         if before is not None:
@@ -149,9 +145,8 @@ def _step(
             probability *= float(h[d] == 0)
         else:
             probability *= math.exp(tables.selection[d][t][0 if caller is None else caller - 1][h[d]])
-    evidence = sum(
-        table[t][choice] for table, choice in zip(tables.evidence, h, strict=False) if table is not None
-    )
+    known = zip(tables.evidence, h, strict=False)
+    evidence = sum(table[t][choice] for table, choice in known if table is not None)
     return probability * math.exp(tables.power * log_density(tables, t, h) + evidence)
 
 

@@ -1,4 +1,4 @@
-"""Planted hierarchies: a truth whose options are known, demonstrations of it, and how well training finds it again."""
+"""Planted hierarchies: a truth with known options, demonstrations of it, and how well training finds it."""
 
 import numpy as np
 import torch
@@ -27,9 +27,8 @@ def small_spec(counts=(2,), policy=LINEAR, name="level", **sections):
 
     :param name: of the level; of several levels each has its number behind it.
     """
-    names = (
-        [name] if len(counts) == 1 and name != "level" else [f"{name}-{d}" for d in range(1, 1 + len(counts))]
-    )
+    several = [f"{name}-{d}" for d in range(1, 1 + len(counts))]
+    names = [name] if len(counts) == 1 and name != "level" else several
     levels = [{"name": own, "count": k, "policy": policy} for own, k in zip(names, counts, strict=True)]
     flat = {"baseline": {"kind": "flat", "policy": policy}}
     return parse_spec(
@@ -50,10 +49,9 @@ def make_spec(counts=(2,), seed=0, control=None, **training):
 def in_units_of(spec, demos, sigma=SIGMA):
     """A spec with the truth's σ in the units to which the controls of these demonstrations are scaled."""
     spreads = np.concatenate([demo.actions for demo in demos]).std(0)
-    parts = [
-        {"name": f"x{d}", "dims": [d], "kind": "gaussian", "std": sigma / own}
-        for d, own in enumerate(spreads)
-    ]
+    parts = []
+    for d, own in enumerate(spreads):
+        parts.append({"name": f"x{d}", "dims": [d], "kind": "gaussian", "std": sigma / own})
     return with_overrides(spec, {"control.parts": parts})
 
 
@@ -63,7 +61,7 @@ def make_trainer(spec, demos, path, on_event=ignore, jobs=1):
 
 
 def plant(truth, number, steps, seed):
-    """Demonstrations and true choices from running the Pyro model forward in a plane that the control moves through."""
+    """Demonstrations and true choices from running the Pyro model in a plane that controls move through."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     state = torch.rand(number, 2, generator=generator) * 2 - 1
@@ -82,9 +80,8 @@ def plant(truth, number, steps, seed):
         choices.append(torch.stack(previous, -1))
         state = (state + action[:, :2].float()).clamp(-1, 1)
     arrays = [torch.stack(part, 1).double().numpy() for part in (states, actions)]
-    return numbered(({"state": state}, action) for state, action in zip(*arrays, strict=True)), torch.stack(
-        choices, 1
-    )
+    rows = zip(*arrays, strict=True)
+    return numbered(({"state": state}, action) for state, action in rows), torch.stack(choices, 1)
 
 
 def preferences(callers, options):
@@ -95,7 +92,7 @@ def preferences(callers, options):
 
 
 def make_truth(spec, ending=-1.7):
-    """Options that each head for a corner of their own; callers that each select among some of the options below."""
+    """Options that each head for a corner of their own; callers that each select some options below."""
     truth = build_hierarchy(spec, Dimensions({"state": (2,)}, 2, 1))
     truth.encoder.requires_grad_(False)
     corners = torch.tensor([[0.8, 0.8], [-0.8, 0.8], [-0.8, -0.8], [0.8, -0.8]])
@@ -106,9 +103,8 @@ def make_truth(spec, ending=-1.7):
                 level.policy.network.layers[0].bias[:] = 0.35 * corners[: level.count, None]
             else:
                 level.policy.network.layers[0].weight.zero_()
-                level.policy.network.layers[0].bias[:] = preferences(
-                    level.count, truth.levels[number - 1].count
-                )
+                below = truth.levels[number - 1].count
+                level.policy.network.layers[0].bias[:] = preferences(level.count, below)
             level.termination.layers[0].weight.zero_()
             level.termination.layers[0].bias[:] = ending
         truth.meta_policy.network.layers[0].weight.zero_()
@@ -130,7 +126,7 @@ def per_step(model, batch):
 
 
 def recovered(found, truth, held_out, choices):
-    """Held-out log-likelihood per step of both, and the NMI of their segments with the true choices of each level."""
+    """Held-out log-likelihood per step of both, and the NMI of their segments with each level's truth."""
     values = {}
     for name, model in (("found", found), ("truth", truth)):
         tables, batch = tabulated(model, held_out)

@@ -1,4 +1,4 @@
-"""Small random demonstrations with a vector, a camera and labels, for tests of files; others by their number."""
+"""Small random demonstrations with a vector, a camera and labels, for tests of files; others by number."""
 
 from collections.abc import Iterable
 from typing import Any

@@ -60,10 +60,9 @@ def spec_at(folder, demos=None, **selection):
 
 
 def scored(candidate, fold, per_step, lengths=(10,)):
-    """By candidate and fold, the metrics of a fit that says ``per_step`` nats in each of these demonstrations."""
-    rows = [
-        {"name": f"demo_{n}", "steps": own, "log_likelihood": per_step * own} for n, own in enumerate(lengths)
-    ]
+    """By candidate and fold, the metrics of a fit that says ``per_step`` nats in each demonstration."""
+    known = {f"demo_{n}": own for n, own in enumerate(lengths)}
+    rows = [{"name": n, "steps": own, "log_likelihood": per_step * own} for n, own in known.items()]
     return {(candidate, fold): made_metrics(valid=rows)}
 
 

@@ -25,9 +25,8 @@ def answer(network, inputs, state=None):
 
 
 def make_inputs(trajectories=2, steps=LONGEST, start=0, images=()):
-    return random_inputs(
-        InputShape({"state": FEATURES}, dict.fromkeys(images, PIXELS)), trajectories, steps, start
-    )
+    shape = InputShape({"state": FEATURES}, dict.fromkeys(images, PIXELS))
+    return random_inputs(shape, trajectories, steps, start)
 
 
 def random_inputs(shape, trajectories, steps, start):
@@ -36,10 +35,8 @@ def random_inputs(shape, trajectories, steps, start):
         key: torch.randint(256, (trajectories, steps, *size), generator=generator, dtype=torch.uint8)
         for key, size in shape.images.items()
     }
-    vectors = {
-        key: torch.randn(trajectories, steps, size, generator=generator)
-        for key, size in shape.vectors.items()
-    }
+    sizes = {key: (trajectories, steps, size) for key, size in shape.vectors.items()}
+    vectors = {key: torch.randn(size, generator=generator) for key, size in sizes.items()}
     return Inputs(vectors, images, torch.arange(start, start + steps))
 
 

@@ -19,18 +19,16 @@ def tracks(page):
     A run is (value, first step, step after the last).
     """
     data = embedded(page)
-    heads = re.findall(
-        r'class="demonstration" id="([^"]*)"><div class="who">(.*?)\n(.*?)</div>', page, re.DOTALL
-    )
+    head = r'class="demonstration" id="([^"]*)"><div class="who">(.*?)\n(.*?)</div>'
+    heads = re.findall(head, page, re.DOTALL)
     found = {}
     for (place, name, mark), track in zip(heads, data["tracks"], strict=True):
         assert html.unescape(name) == track["name"]
         lanes = {}
         for lane, runs in zip(data["lanes"], track["lanes"], strict=True):
             ends = pairwise([*runs["s"], track["steps"]]) if runs else ()
-            lanes[lane["name"]] = [
-                (value, *ab) for value, ab in zip(runs["v"] if runs else (), ends, strict=True)
-            ]
+            values = zip(runs["v"] if runs else (), ends, strict=True)
+            lanes[lane["name"]] = [(value, *ab) for value, ab in values]
         found[track["name"]] = place, "held out" in mark, lanes
     return found
 

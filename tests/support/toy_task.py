@@ -48,10 +48,8 @@ class Point(dm_env.Environment):
         return {"offsets": offsets, "visited": np.array([float(self.visited)])}
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        return {
-            "offsets": specs.Array((4,), float, "offsets"),
-            "visited": specs.Array((1,), float, "visited"),
-        }
+        sizes = {"offsets": (4,), "visited": (1,)}
+        return {name: specs.Array(size, float, name) for name, size in sizes.items()}
 
     def action_spec(self) -> specs.BoundedArray:
         return specs.BoundedArray((2,), float, -1.0, 1.0, "velocity")

@@ -68,9 +68,8 @@ class Remembering(nn.Module):
     def initial_state(self, trajectories):
         features = self.head.in_features
         state = torch.zeros(trajectories, features), torch.zeros(trajectories)
-        return {"list": list(state), "without trajectories": (torch.zeros(features), state[1])}.get(
-            self.how, state
-        )
+        states = {"list": list(state), "without trajectories": (torch.zeros(features), state[1])}
+        return states.get(self.how, state)
 
     def forward(self, inputs, state):
         total, steps = state
@@ -98,9 +97,8 @@ class WithMemory(nn.Module):
         super().__init__()
         self.how, self.size = how, (copies, outputs)
         self.lstm = nn.LSTM(shape.vector, 16, batch_first=how != "over trajectories")
-        self.head = nn.Linear(
-            16 if how in ("over time", "over trajectories") else shape.vector, copies * outputs
-        )
+        features = 16 if how in ("over time", "over trajectories") else shape.vector
+        self.head = nn.Linear(features, copies * outputs)
 
     def forward(self, inputs):
         features = {

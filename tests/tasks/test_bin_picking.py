@@ -1,4 +1,4 @@
-"""Bin picking against independent truths: MuJoCo's cameras, a dead band in small steps, grasps and mishaps by hand."""
+"""Bin picking against independent truths: MuJoCo's cameras, a dead band in small steps, mishaps by hand."""
 
 from collections.abc import Iterator
 
@@ -26,7 +26,7 @@ def environment() -> Iterator[Environment]:
 
 
 def go(environment: Environment, position: tuple[float, float, float], jaw: float, turn: float = 0.8) -> dict:
-    """A control step that truly brings the gripper to ``position`` [3] (m), but for what is not repeatable."""
+    """A control step that truly brings the gripper to ``position`` [3] (m), up to what is not repeatable."""
     joints = psm.inverse(geometry.upright(turn, np.array(position)))
     return environment.step(np.append(environment.physics.command(joints), jaw))
 
@@ -45,17 +45,13 @@ def test_points_are_where_mujocos_camera_sees_them(environment: Environment, eye
     points = np.random.default_rng(0).uniform([-0.025, -0.025, 0.0], [0.025, 0.025, 0.03], (20, 3))
     column, row, depth = seen.matrix @ np.column_stack([points, np.ones(20)]).T
     truth = np.column_stack([column / depth, row / depth])
-    np.testing.assert_allclose(
-        geometry.project(points, right), truth, atol=0.51
-    )  # from corners or from centres
+    # from corners or from centres
+    np.testing.assert_allclose(geometry.project(points, right), truth, atol=0.51)
 
 
 def test_a_pixel_is_turned_back_into_its_point() -> None:
-    points = np.random.default_rng(1).uniform(-0.025, 0.025, (20, 3)) * [1, 1, 0] + [
-        0,
-        0,
-        geometry.OBJECT_HEIGHT,
-    ]
+    points = np.random.default_rng(1).uniform(-0.025, 0.025, (20, 3)) * [1, 1, 0]
+    points += [0, 0, geometry.OBJECT_HEIGHT]
     for point in points:
         np.testing.assert_allclose(geometry.lying_at(geometry.project(point)), point, atol=1e-12)
 
@@ -70,9 +66,8 @@ def test_backlash_is_a_dead_band_moved_through_in_small_steps() -> None:
     for _ in range(20):
         goal = motors + 3 * BACKLASH * generator.standard_normal(6)
         slack = slack_after(slack, goal - motors)
-        for step in np.linspace(
-            motors, goal, 200
-        ):  # a joint is pushed by whichever side of the gap touches it
+        # a joint is pushed by whichever side of the gap touches it
+        for step in np.linspace(motors, goal, 200):
             joints = np.where(step - joints > BACKLASH, step - BACKLASH, joints)
             joints = np.where(joints - step > BACKLASH, step + BACKLASH, joints)
         motors = goal
@@ -125,9 +120,8 @@ def test_objects_that_no_demonstration_has_shown_are_held_and_only_the_thread_ha
         go(environment, (0.0, 0.012, height), jaw, np.pi / 2)
     assert physics.held() == {0}
     own = physics.model.geom_bodyid >= physics.model.name2id("object_0", "body")
-    assert (np.ptp(physics.data.geom_xpos[own, 2]) > 0.008) == (
-        kind == "thread"
-    )  # m, between middles of its parts
+    thickness = np.ptp(physics.data.geom_xpos[own, 2])  # m, between middles of its parts
+    assert (thickness > 0.008) == (kind == "thread")
     go(environment, (0.0, 0.012, 0.030), 1, np.pi / 2)
     assert physics.held() == frozenset()
     environment.close()
@@ -148,9 +142,7 @@ def test_a_grasp_on_the_foam_ends_the_bin(environment: Environment) -> None:
     assert task.outcome(environment)["ended_foam"] == 1.0
 
 
-def test_a_simulation_that_breaks_down_ends_the_bin_with_finite_observations(
-    environment: Environment,
-) -> None:
+def test_a_simulation_that_breaks_down_ends_with_finite_observations(environment: Environment) -> None:
     environment.physics.named.data.qvel["object_0"] = np.nan
     step = go(environment, (0.0, 0.0, 0.03), 1)
     assert step.last()
@@ -158,16 +150,11 @@ def test_a_simulation_that_breaks_down_ends_the_bin_with_finite_observations(
     assert all(np.isfinite(value).all() for value in step.observation.values())
 
 
-def test_a_grasp_is_of_what_is_seen_in_the_bin(
-    environment: Environment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_grasp_is_of_what_is_seen_in_the_bin(environment: Environment, monkeypatch) -> None:
     """Both eyes see the inner edge of the accept cup, too."""
     seen = np.zeros((geometry.IMAGE_SIZE, geometry.IMAGE_SIZE, 2), np.uint8)
-    pixels = (
-        geometry.project(np.array([[-0.04, y, 0.002] for y in np.linspace(-0.02, 0.02, 81)]))
-        .round()
-        .astype(int)
-    )
+    edge = np.array([[-0.04, y, 0.002] for y in np.linspace(-0.02, 0.02, 81)])
+    pixels = geometry.project(edge).round().astype(int)
     seen[pixels[:, 1], pixels[:, 0]] = 255
     monkeypatch.setattr(bin_picking.camera, "masks", lambda _: seen)
     go(environment, (0.0, 0.02, 0.03), 0)
@@ -180,12 +167,8 @@ def test_four_misses_in_a_row_end_the_bin(environment: Environment) -> None:
     ended = [go(environment, (0.0, 0.02, 0.03), jaw).last() for jaw in jaws]
     assert ended == [False] * 7 + [True]
     found = task.outcome(environment)
-    assert (found["ended_missed"], found["attempts"], found["empty"], found["recovered"]) == (
-        1.0,
-        4.0,
-        4.0,
-        4.0,
-    )
+    counts = [found[name] for name in ("ended_missed", "attempts", "empty", "recovered")]
+    assert counts == [1.0, 4.0, 4.0, 4.0]
 
 
 # Bookkeeping, on attempts made up by hand.
@@ -203,15 +186,8 @@ def test_measures_of_attempts() -> None:
         Attempt(1, frozenset({2}), frozenset({2}), (), 10),  # never let go
     ]
     trials = Trials(["pin", "wire", "needle"], attempts, end=End.MISSED)
-    expected = {
-        "success": 0,
-        "cleared": 0,
-        "ended_missed": 1,
-        "objects": 3,
-        "attempts": 7,
-        "single": 3,
-        "empty": 2,
-    }
+    expected = {"success": 0, "cleared": 0, "ended_missed": 1, "objects": 3, "attempts": 7}
+    expected |= {"single": 3, "empty": 2}
     expected |= {"several": 2, "slipped": 1, "due_cups": 3, "kept": 2, "delivered": 2, "sorted": 1}
     expected |= {"due_recoveries": 3, "recovered": 2, "nothing": 2, "nothing_recovered": 1}
     found = trials.measures()

@@ -1,4 +1,4 @@
-"""The forms of bin picking's controls against independent truths: what encoders read, OpenCV, the polar factor."""
+"""The forms of bin picking's controls against independent truths: what encoders read, OpenCV, polar parts."""
 
 import cv2
 import numpy as np
@@ -59,9 +59,8 @@ def test_a_bar(turned: bool) -> None:
     mask = np.zeros((40, 40), np.uint8)
     mask[4:7, 10:31] = 255
     found = numbers(mask.T if turned else mask)
-    across, along = (
-        (size**2 - 1) / 12 * 63 / 62 for size in (3, 21)
-    )  # variances of a sample of evenly spaced places
+    # variances of a sample of evenly spaced places
+    across, along = ((size**2 - 1) / 12 * 63 / 62 for size in (3, 21))
     rows, columns = [4, 5, 6], [10, 20, 30]
     (top, row, bottom), (left, column, right) = (columns, rows) if turned else (rows, columns)
     expected = {

@@ -16,10 +16,10 @@ QUICK = ("needle", "pushing_goal", "bin_picking")
 """The others differ from them in what is observed or in when they end."""
 
 
-@pytest.fixture(
-    scope="module",
-    params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES],
-)
+EACH = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
+
+
+@pytest.fixture(scope="module", params=EACH)
 def task(request: pytest.FixtureRequest) -> Task:
     """Each registered task in turn."""
     return find_task(request.param)
@@ -113,9 +113,8 @@ def test_equal_seeds_give_equal_episodes_to_their_ends(task: Task, supervised) -
     environment, policy = make(task, "supervisor", seed=2)
     before, steps, actions = supervised
     again = episode(environment, policy)
-    for number, ((step, action), first_step, first_action) in enumerate(
-        zip(again, steps, actions, strict=True)
-    ):
+    pairs = enumerate(zip(again, steps, actions, strict=True))
+    for number, ((step, action), first_step, first_action) in pairs:
         np.testing.assert_array_equal(action, first_action, err_msg=f"step {number}")
         np.testing.assert_equal(step._asdict(), first_step._asdict(), err_msg=f"step {number}")
     np.testing.assert_equal(task.outcome(environment), task.outcome(before))

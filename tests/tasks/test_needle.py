@@ -1,5 +1,6 @@
 """The needle task against independent truths: MuJoCo's own poses, projected points, the paper's figures."""
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -26,9 +27,8 @@ def environment() -> Iterator[Environment]:
 def workspace(heights: tuple[float, ...] = (0.0, 0.01, 0.02, 0.03)) -> list[Pose]:
     """Upright gripper poses over the 10 x 10 cm workspace."""
     across = np.linspace(-0.05, 0.05, 9)
-    return [
-        Pose(psm.rotation(2, np.pi / 4), np.array([x, y, z])) for x in across for y in across for z in heights
-    ]
+    turned, places = psm.rotation(2, np.pi / 4), itertools.product(across, across, heights)
+    return [Pose(turned, np.array(place)) for place in places]
 
 
 def lay(environment: Environment, x: float, y: float, heading: float, gripper: Pose) -> Pose:
@@ -70,9 +70,8 @@ def test_forward_kinematics_is_mujocos(environment: Environment) -> None:
             physics.named.data.qpos[list(psm.JOINTS)] = joints
         gripper = psm.forward(joints)
         np.testing.assert_allclose(gripper.position, physics.named.data.site_xpos["gripper"], atol=1e-7)
-        np.testing.assert_allclose(
-            gripper.rotation.ravel(), physics.named.data.site_xmat["gripper"], atol=1e-6
-        )
+        rotation = physics.named.data.site_xmat["gripper"]
+        np.testing.assert_allclose(gripper.rotation.ravel(), rotation, atol=1e-6)
 
 
 def test_inverse_kinematics_is_the_inverse() -> None:
@@ -98,26 +97,25 @@ def test_reported_pose_is_where_the_encoders_were_sent(environment: Environment)
     np.testing.assert_allclose(observation["gripper_pose"][:3], 1e3 * wanted.position, atol=0.8)
     np.testing.assert_allclose(observation["gripper_pose"][3:], [0.0, 0.0, 0.7], atol=0.03)
     true = environment.physics.gripper().position
-    assert (
-        1e3 * np.linalg.norm(true - wanted.position) > 1.0
-    )  # kinematic error, which the report does not show
+    # kinematic error, which the report does not show
+    assert 1e3 * np.linalg.norm(true - wanted.position) > 1.0
 
 
 # Vision.
 
 
-@pytest.mark.parametrize(
-    ("x", "y", "heading"), [(-0.02, 0.0, -0.8), (-0.03, 0.015, -0.3), (-0.005, 0.01, -1.3)]
-)
+PLACES = [(-0.02, 0.0, -0.8), (-0.03, 0.015, -0.3), (-0.005, 0.01, -1.3)]
+
+
+@pytest.mark.parametrize(("x", "y", "heading"), PLACES)
 def test_ellipse_is_where_the_needle_is(environment: Environment, x: float, y: float, heading: float) -> None:
     pose = lay(environment, x, y, heading, AWAY)
     angles = np.linspace(-geometry.ARC_HALF_ANGLE, geometry.ARC_HALF_ANGLE, 181)
     arc = pose.apply(geometry.ARC_RADIUS * np.stack([np.sin(angles), 1 - np.cos(angles), 0 * angles], axis=1))
     chord = arc[-1] - arc[0]
     seen = environment.task.get_observation(environment.physics)["needle_ellipse"]
-    centre = arc[:, :2].mean(
-        axis=0
-    )  # within half a millimetre of the centre of the hull's ellipse: both on the axis
+    # within half a millimetre of the centre of the hull's ellipse: both on the axis
+    centre = arc[:, :2].mean(axis=0)
     sideways = np.array([-chord[1], chord[0]]) / np.linalg.norm(chord[:2])
     assert abs((seen[:2] - 1e3 * centre) @ chord[:2]) / np.linalg.norm(chord[:2]) < 0.3
     assert abs((seen[:2] - 1e3 * centre) @ sideways) < 1.5
@@ -128,13 +126,10 @@ def test_ellipse_is_where_the_needle_is(environment: Environment, x: float, y: f
     assert seen[2] == pytest.approx(1e3 * np.linalg.norm(chord), abs=3.0)
 
 
-def test_a_hidden_needle_keeps_its_last_ellipse(
-    environment: Environment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hidden_needle_keeps_its_last_ellipse(environment: Environment, monkeypatch) -> None:
     before = environment.task.get_observation(environment.physics)["needle_ellipse"]
-    monkeypatch.setattr(
-        needle, "render", lambda *_: np.zeros((vision.IMAGE_SIZE, vision.IMAGE_SIZE, 3), np.uint8)
-    )
+    black = np.zeros((vision.IMAGE_SIZE, vision.IMAGE_SIZE, 3), np.uint8)
+    monkeypatch.setattr(needle, "render", lambda *_: black)
     after = environment.task.get_observation(environment.physics)["needle_ellipse"]
     np.testing.assert_array_equal(before, after)
 
@@ -143,7 +138,7 @@ def test_a_hidden_needle_keeps_its_last_ellipse(
 
 
 def grasp_with_offset(environment: Environment, offset_mm: tuple[float, float, float] = (0, 0, 0)) -> bool:
-    """Whether the needle comes up with a gripper that is off by (along the wire, across it, up) millimetres."""
+    """Whether the needle comes up with a gripper off by (along the wire, across it, up) millimetres."""
     pose = lay(environment, -0.018, 0.004, geometry.MIDDLE_HEADING, AWAY)
     at = geometry.grasp_pose(pose)
     at = Pose(at.rotation, pose.apply(1e-3 * np.array(offset_mm)))
@@ -162,7 +157,7 @@ def test_aligned_jaws_alone_grasp(environment: Environment, offset: tuple[float,
 
 
 def insert_with_offset(environment: Environment, sideways_mm: float, turn: float) -> dict[str, float]:
-    """The measures after a true grasp and an insertion whose heading and height are right but for the offsets."""
+    """The measures after a true grasp and an insertion with the right heading and height but for offsets."""
     assert grasp_with_offset(environment)
     target = environment.physics.target() + np.array([0.0, 1e-3 * sideways_mm, 0.0])
     into = geometry.insertion_pose(environment.physics.grip(), target)
@@ -222,7 +217,6 @@ def test_planned_paths_go_round_obstacles_and_repeat() -> None:
 
 def test_a_goal_in_an_obstacle_has_no_path() -> None:
     ranges = np.array([[-1.0, 1.0]] * 2)
+    ends = np.array([-0.5, 0.0]), np.array([0.5, 0.0])
     with pytest.raises(planning.NoPath, match="goal of the path collides"):
-        planning.plan_path(
-            np.array([-0.5, 0.0]), np.array([0.5, 0.0]), ranges, lambda point: bool(point[0] < 0.2)
-        )
+        planning.plan_path(*ends, ranges, lambda point: bool(point[0] < 0.2))

@@ -1,4 +1,4 @@
-"""A machine without what cameras are drawn with: one line that says what to install, before anything else is done."""
+"""A machine without what cameras are drawn with: one line that says what to install, before all else."""
 
 import os
 import subprocess
@@ -39,9 +39,8 @@ def ended(*command: str | Path, **environment: str) -> subprocess.CompletedProce
 
 
 LOOKING = "import runpy; runpy.run_path('tasks/opengl.py', run_name='__main__')"
-CHECKING = (
-    "sys.argv = ['ddco-pyro', 'check', 'specs/needle.yaml']; from ddco_pyro.cli.app import main; main()"
-)
+CHECKING = "sys.argv = ['ddco-pyro', 'check', 'specs/needle.yaml']; "
+CHECKING += "from ddco_pyro.cli.app import main; main()"
 
 
 @pytest.mark.parametrize("cause", LIBRARIES)
@@ -59,9 +58,10 @@ def test_without_opengl_libraries_one_line_names_the_packages(cause: str, script
     assert f"apt-get install {PACKAGES}" in advice(cause)
 
 
-@pytest.mark.parametrize(
-    "own", [{}, NO_DRIVER | {"MUJOCO_GL": "osmesa"}, NO_DRIVER | {"DISPLAY": ":0"}], ids=str
-)
+MACHINES = [{}, NO_DRIVER | {"MUJOCO_GL": "osmesa"}, NO_DRIVER | {"DISPLAY": ":0"}]
+
+
+@pytest.mark.parametrize("own", MACHINES, ids=str)
 def test_where_the_tasks_can_draw_nothing_is_said(own: dict[str, str]) -> None:
     """Another renderer, or a display, is taken to work."""
     found = ended(sys.executable, "tasks/opengl.py", **own)

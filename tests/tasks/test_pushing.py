@@ -1,4 +1,4 @@
-"""The pushing task against independent truths: MuJoCo's poses, Coulomb friction, statics, brute-force collisions."""
+"""The pushing task against independent truths: MuJoCo's poses, Coulomb friction, statics, collisions."""
 
 from collections.abc import Iterator
 
@@ -50,9 +50,8 @@ def test_forward_kinematics_is_mujocos(environment: Environment) -> None:
     low, high = pushing_geometry.JOINT_RANGES.T
     for angles in np.random.default_rng(0).uniform(low, high, (20, 3)):
         arrange(environment, angles, 0.0, 0.3)
-        np.testing.assert_allclose(
-            pushing_geometry.tip_position(angles), environment.physics.tip(), atol=1e-9
-        )
+        tip = pushing_geometry.tip_position(angles)
+        np.testing.assert_allclose(tip, environment.physics.tip(), atol=1e-9)
 
 
 def test_inverse_kinematics_is_the_inverse() -> None:
@@ -93,7 +92,7 @@ def test_a_sliding_box_stops_by_coulomb_friction(environment: Environment, speed
 
 
 def test_a_low_push_slides_the_box_and_a_high_one_topples_it(environment: Environment) -> None:
-    """Statics: it tips over its edge where the push is higher than half its width over the friction, 0.2 m."""
+    """Statics: it tips over its edge where the push is above half its width over the friction, 0.2 m."""
     assert push(environment, 0.10) < 0.05
     assert environment.physics.box()[0] > 0.2
     assert environment.task.counts.topples == 0

@@ -1,4 +1,4 @@
-"""Pushing whose goal is shown once: what is seen after the cue does not tell the goal, and outcomes are the box's."""
+"""Pushing whose goal is shown once: nothing after the cue tells the goal, and outcomes are the box's."""
 
 import numpy as np
 import pytest

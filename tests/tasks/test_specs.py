@@ -1,4 +1,4 @@
-"""Every spec of a task is checked against the task; specs of pushing and bin picking are fitted, and act in it."""
+"""Every spec of a task is checked against it; specs of pushing and bin picking are fitted, and act in it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +19,8 @@ from ddco_pyro.training.data import dimensions
 from ddco_pyro.training.networks import check_networks
 
 SPECS = sorted((Path(__file__).parents[2] / "specs").glob("*.yaml"))
-OF_FILES = (
-    "metaworld_pick_place",
-    "metaworld_library",
-    "many_tasks",
-)  # files that are not in this repository
+# files that are not in this repository
+OF_FILES = ("metaworld_pick_place", "metaworld_library", "many_tasks")
 BIN_PICKING = next(path for path in SPECS if path.stem == "bin_picking")
 CAMERAS = {"camera": pushing.camera(48, 64)}
 QUICK = ("pushing_3level", "pushing_hybrid", "pushing_flat_mlp")
@@ -41,9 +38,10 @@ TINY = [
 ]
 
 
-@pytest.mark.parametrize(
-    "path", [path for path in SPECS if path.stem not in OF_FILES], ids=lambda path: path.stem
-)
+OF_TASKS = [path for path in SPECS if path.stem not in OF_FILES]
+
+
+@pytest.mark.parametrize("path", OF_TASKS, ids=lambda path: path.stem)
 def test_specs_are_checked_against_their_tasks(path: Path) -> None:
     spec = load_spec(path, allow_code=True)
     known = dimensions(spec)
@@ -100,12 +98,10 @@ def test_demonstrations_show_what_the_person_saw(picked: Path) -> None:
     for demo in Demonstrations.read(picked, labels=("phase", "held", "kind", "left")):
         assert set(np.unique(np.asarray(demo.observations["image"]))) == {0, 255}
         opened = demo.observations["kin"][:, 6] > JAW_OPEN / 2
-        np.testing.assert_array_equal(
-            opened[1:], demo.actions[:-1, 6]
-        )  # the jaws are as they were told to be
-        carried = np.diff(demo.labels["phase"] == 4, prepend=False) & (
-            demo.labels["phase"] == 4
-        )  # begins to be
+        # the jaws are as they were told to be
+        np.testing.assert_array_equal(opened[1:], demo.actions[:-1, 6])
+        carrying = demo.labels["phase"] == 4
+        carried = np.diff(carrying, prepend=False) & carrying  # begins to be
         assert (demo.labels["kind"][carried] >= 0).all()
         back = np.diff(demo.labels["phase"] == 3, prepend=False) & (demo.labels["phase"] == 3)
         assert (demo.labels["held"][back] != 1).all()

@@ -28,9 +28,8 @@ from ddco_pyro.training import processes
 from ddco_pyro.training.networks import Dimensions, build_hierarchy
 from ddco_pyro.training.restarts import OtherDevice
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*to a meta parameter:UserWarning"
-)  # the double is called meta
+# the double is called meta
+pytestmark = pytest.mark.filterwarnings("ignore:.*to a meta parameter:UserWarning")
 
 # --- a double: tensors that say they are on ``THERE``, have their numbers here, and mix with no others ------
 
@@ -105,11 +104,8 @@ MLP = {"network": "mlp", "hidden": [6], "inputs": ["pose"]}
 LINEAR = {"network": "linear", "inputs": ["pose"]}
 LSTM = {"network": "lstm", "over": {"network": "mlp", "hidden": [4], "inputs": ["pose"]}, "hidden": 3}
 TIMES = {"network": "per_timestep", "hidden": [4], "inputs": ["pose"]}
-BRANCHES = {
-    "network": "branches",
-    "of": {"camera": MEANS, "pose": {"network": "mlp", "hidden": [3]}},
-    "hidden": [4],
-}
+OF = {"camera": MEANS, "pose": {"network": "mlp", "hidden": [3]}}
+BRANCHES = {"network": "branches", "of": OF, "hidden": [4]}
 SAME = {"mlp": {"policy": MLP, "termination": LINEAR}}
 """Those of which a double computes every number as the host does."""
 
@@ -166,10 +162,8 @@ def weights(fit: ddco_pyro.Fit) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("network", ALL)
-def test_a_fit_with_networks_elsewhere(
-    demos: Demonstrations, network: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each tensor that meets another is asked for its device; weights and numbers are those of a fit on the host."""
+def test_a_fit_with_networks_elsewhere(demos: Demonstrations, network: str, monkeypatch) -> None:
+    """Each tensor that meets another is asked for its device; weights and numbers are a fit's on the host."""
     spec = spec_of(
         (SAME | OTHER)[network],
         optimizer={"name": "momentum", "lr": 0.01},  # Adam's steps hide their sizes
@@ -180,9 +174,8 @@ def test_a_fit_with_networks_elsewhere(
     on(monkeypatch, THERE)
     with Device():
         there = ddco_pyro.fit(spec, demos)
-        placed = [
-            parameter for module in there.hierarchy.networks().values() for parameter in module.parameters()
-        ]
+        networks = there.hierarchy.networks().values()
+        placed = [parameter for module in networks for parameter in module.parameters()]
         assert placed
         assert all(isinstance(parameter.data, Elsewhere) for parameter in placed)
         others = {id(parameter) for parameter in there.hierarchy.parameters()} - set(map(id, placed))
@@ -209,10 +202,8 @@ def test_no_gpu_is_one_line(demos: Demonstrations, tmp_path) -> None:
     data = json.loads(spec_of(SAME["mlp"], device="cuda").model_dump_json(by_alias=True))
     data["demonstrations"]["path"] = str(tmp_path / "demos.hdf5")
     (tmp_path / "spec.yaml").write_text(yaml.safe_dump(data))
-    for command in (
-        ["fit", tmp_path / "spec.yaml", "--out", tmp_path / "run"],
-        ["check", tmp_path / "spec.yaml"],
-    ):
+    spec = tmp_path / "spec.yaml"
+    for command in (["fit", spec, "--out", tmp_path / "run"], ["check", spec]):
         refused(f": training.device: cuda: torch {torch.__version__} has no GPU here", *command)
     assert not (tmp_path / "run").exists()
     assert "networks: on cpu" in done("check", tmp_path / "spec.yaml", "--set", "training.device=auto").out
@@ -230,9 +221,7 @@ def test_of_several_gpus_each_process_has_its_own(monkeypatch: pytest.MonkeyPatc
     assert processes.device_of(spec_of(SAME["mlp"]).training) == torch.device("cpu")
 
 
-def test_a_run_goes_on_where_it_was_begun(
-    demos: Demonstrations, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_goes_on_where_it_was_begun(demos: Demonstrations, tmp_path, monkeypatch) -> None:
     """On the same kind of device bit for bit; on another it is refused before a bit is trained."""
     spec = spec_of(DROPPING, starts=["random"])
     on(monkeypatch, THERE)
@@ -241,9 +230,8 @@ def test_a_run_goes_on_where_it_was_begun(
         with pytest.raises(KeyboardInterrupt):
             ddco_pyro.fit(spec, demos, tmp_path / "killed", on_event=Interrupting(2))
     on(monkeypatch, torch.device("cpu"))
-    with pytest.raises(
-        OtherDevice, match=r"restart-0.safetensors: was trained on meta, and networks are on cpu here"
-    ):
+    says = r"restart-0.safetensors: was trained on meta, and networks are on cpu here"
+    with pytest.raises(OtherDevice, match=says):
         ddco_pyro.fit(spec, demos, tmp_path / "killed")
     on(monkeypatch, THERE)
     with Device():

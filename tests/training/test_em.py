@@ -1,4 +1,4 @@
-"""Expectation-maximisation: closed forms, stationary points of the penalised likelihood, steps that never lower it."""
+"""Expectation-maximisation: closed forms, stationary points of the penalised likelihood, rising steps."""
 
 import numpy as np
 import pytest
@@ -117,9 +117,8 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
     assert np.diff(values).min() > -1e-9 * abs(values[-1])
     assert values[-1] > values[0] + 1
     value = penalised(model, in_double(batch), ridge)
-    learned = [
-        (name, one) for name, one in model.named_parameters() if one.numel()
-    ]  # a constant has no weights
+    # a constant has no weights
+    learned = [(name, one) for name, one in model.named_parameters() if one.numel()]
     free = [(name, one) for name, one in learned if "raw" not in name or not _at_floor(model, name)]
     gradients = torch.autograd.grad(value, [one for _, one in free])
     for (name, _), gradient in zip(free, gradients, strict=True):
@@ -154,11 +153,10 @@ def baum_welch(weights, start, ends):
 
 
 def test_constant_gates_and_terminations_are_the_hidden_markov_model_that_baum_welch_fits():
-    """Beside policies that read; by numpy: the likelihood, and at its maximum the fixed point of Baum and Welch."""
+    """Beside policies that read; by numpy: the likelihood, and, at its maximum, Baum-Welch's fixed point."""
     model, batch = linear((3,), above=CONSTANT, std=LEARNED).double(), batch_for(None, 20, 12)
-    skills = (
-        (torch.arange(12) + torch.arange(20)[:, None]) // torch.tensor([5, 3, 2]).repeat(7)[:20, None] % 3
-    )
+    periods = torch.tensor([5, 3, 2]).repeat(7)[:20, None]
+    skills = (torch.arange(12) + torch.arange(20)[:, None]) // periods % 3
     batch = Batch(batch.inputs, batch.actions + skills[..., None], batch.lengths)
     expectation(model, RidgeSpec(gate=7.0), batch)  # ridges are of weights: constants have none
     (policy,), gate = model.option_levels(), model.meta_policy.network.layers[0].bias[0, 0].detach()
@@ -189,9 +187,8 @@ def test_levels_are_discovered_under_a_uniform_meta_policy(discovering):
     levels = tuple(f"levels.{level}." for level in range(discovering))
     there = [(name, one) for name, one in model.named_parameters() if name.startswith(levels)]
     assert len(there) == 5 * discovering - (discovering == 2)  # the second level has no σ
-    gradients = torch.autograd.grad(
-        penalised(model, in_double(batch), ridge, discovering), [one for _, one in there]
-    )
+    value = penalised(model, in_double(batch), ridge, discovering)
+    gradients = torch.autograd.grad(value, [one for _, one in there])
     for (name, _), gradient in zip(there, gradients, strict=True):
         assert gradient.abs().max() < 2e-2, name
 
@@ -292,17 +289,11 @@ def em_spec(**training):
 def test_a_fit_by_em_says_so_and_trains_what_is_not_linear_by_gradients():
     fit = ddco_pyro.fit(em_spec(), demonstrations(12))
     trained = fit.metrics.trainings
-    assert {name: one.by_em for name, one in trained.items()} == {
-        "ddco": True,
-        "mixture": True,
-        "flat": False,
-    }
+    by_em = {name: one.by_em for name, one in trained.items()}
+    assert by_em == {"ddco": True, "mixture": True, "flat": False}
     assert trained["ddco"].spent.gradient_steps == trained["ddco"].spent.epochs
-    assert {name: one.by_lbfgs for name, one in trained.items()} == {
-        "ddco": False,
-        "mixture": False,
-        "flat": True,
-    }
+    by_lbfgs = {name: one.by_lbfgs for name, one in trained.items()}
+    assert by_lbfgs == {"ddco": False, "mixture": False, "flat": True}
     assert trained["flat"].spent.gradient_steps == trained["flat"].spent.epochs
     assert "(EM)" in verdicts.effort(trained["ddco"])
     assert "(L-BFGS)" in verdicts.effort(trained["flat"])
@@ -370,7 +361,7 @@ def test_tuning_demonstrations_decide_nothing_before_the_last_stage():
 
 
 def bimanual(number=20, steps=60, seed=0):
-    """Fourteen joint positions of two arms, through six poses that vary with the demonstration, as objects do."""
+    """Fourteen joint positions of two arms, through six poses that vary by demonstration, as objects do."""
     random = np.random.default_rng(seed)
     poses, rows = 0.5 * random.normal(size=(6, 14)), []
     for _ in range(number):
@@ -398,17 +389,8 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
         path = tmp_path / f"{len(demos)}.hdf5"
         demos.write(path)
         spec = parse_spec(yaml.safe_load(starting_spec(inspect(path), path).text))
-        return ddco_pyro.fit(
-            with_overrides(
-                spec,
-                {
-                    "compare_with": [],
-                    "training.epochs": 16,
-                    "training.starts": ["vq_controls"],
-                    **dict(overrides),
-                },
-            )
-        ).metrics
+        short = {"compare_with": [], "training.epochs": 16, "training.starts": ["vq_controls"]}
+        return ddco_pyro.fit(with_overrides(spec, short | dict(overrides))).metrics
 
     fallen = fitted(bimanual(20), ("training.optimizer.ridge.cross_validated", False))
     held, many = fitted(bimanual(20)), fitted(pick_and_place(30))
@@ -419,9 +401,10 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
     assert held.log_likelihood_per_step.valid > fallen.log_likelihood_per_step.valid + 50
 
 
-@pytest.mark.parametrize(
-    ("number", "parts", "ridge"), [(1, None, 2.0), (6, None, 0.0), (6, ACTIONS[:1], 2.0)]
-)
+ALONE = [(1, None, 2.0), (6, None, 0.0), (6, ACTIONS[:1], 2.0)]
+
+
+@pytest.mark.parametrize(("number", "parts", "ridge"), ALONE)
 def test_a_ridge_stays_where_nothing_can_be_left_out(number, parts, ridge):
     """Of a single demonstration, without a ridge, and where no control is continuous."""
     model, batch = linear((2,), parts), batch_for(parts)

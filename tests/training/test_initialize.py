@@ -53,7 +53,7 @@ def test_equal_parts_cut_each_demonstration_for_itself():
 
 @pytest.mark.parametrize(("read", "found"), [(["quiet"], "quiet"), ([], "loud")])
 def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
-    """Two observations say different things; terminations and meta-policy read both, policies what they name."""
+    """Two observations say different things; gates and meta-policy read both, policies what they name."""
     steps = sum(LENGTHS)
     truth = {"quiet": np.arange(steps) % 2, "loud": np.arange(steps) // 2 % 2}
     rows = {"quiet": truth["quiet"][:, None], "loud": np.repeat(truth["loud"][:, None], 9, axis=1)}
@@ -67,9 +67,8 @@ def test_what_policies_of_options_do_not_read_does_not_begin_them(read, found):
     objective = Objective(material, Progress(0), plan(spec, 1)[0])
     known = [int(name.removeprefix("demo_")) for name in material.names]
     truths = np.concatenate([np.split(truth[found], cuts)[number] for number in known])
-    assert (
-        adjusted_rand_score(truths, alive(objective.known[0][1], [LENGTHS[number] for number in known])) == 1
-    )
+    begun = alive(objective.known[0][1], [LENGTHS[number] for number in known])
+    assert adjusted_rand_score(truths, begun) == 1
 
 
 FEW = (3, 2, 4)
@@ -120,9 +119,8 @@ def test_images_are_seen_as_block_means():
 @pytest.mark.filterwarnings("error")
 def test_there_are_no_more_clusters_than_distinct_observations():
     place = np.arange(sum(LENGTHS)) % 3
-    batch = make_batch(
-        np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])[place], random_rows(1, 2)
-    )
+    corners = np.array([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
+    batch = make_batch(corners[place], random_rows(1, 2))
     assert adjusted_rand_score(place, alive(Clusters(batch, 5, seed=0).choices(batch))) == 1
     assert set(alive(Clusters(batch, 5, seed=0, controls=True).choices(batch))) == {1, 2, 3, 4, 5}
 

@@ -107,14 +107,12 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
 
 
 def test_the_label_wins_over_the_cluster():
-    demos = random_demonstrations(
-        [[7, -1, 3, 3], [-1, 3, -1, -1], [3, 7, 7, -1], [-1, -1, -1, 7], [7, -1, -1, -1]]
-    )
+    first = [[7, -1, 3, 3], [-1, 3, -1, -1], [3, 7, 7, -1]]
+    demos = random_demonstrations([*first, [-1, -1, -1, 7], [7, -1, -1, -1]])
     material = make(labelled(), demos)
     objective = Objective(material, Progress(0), plan(material.spec, 1)[0])
-    for known, names in zip(
-        objective.known, (material.names, set(demos.names) - set(material.names)), strict=True
-    ):
+    names_of = (material.names, set(demos.names) - set(material.names))
+    for known, names in zip(objective.known, names_of, strict=True):
         for choices, demo in zip(known[1].tolist(), demos.select(names), strict=True):
             for choice, label in zip(choices, demo.labels["phase"].tolist(), strict=True):
                 assert choice == {3: 1, 7: 2}.get(label, choice)
@@ -124,15 +122,12 @@ def test_the_label_wins_over_the_cluster():
 # --- which labels are used ----------------------------------------------------------------------------------
 
 
+MANY = r"labels/phase has 3 labels from 0 on \(0, 1, 2\), but level 'level-1' has 2 options"
+NONE = "labels/phase is -1 at every step of the demonstrations to train with"
+
+
 @pytest.mark.parametrize(
-    ("labels", "message"),
-    [
-        (
-            [[0, 1, 2], [0, 1, 2]],
-            r"labels/phase has 3 labels from 0 on \(0, 1, 2\), but level 'level-1' has 2 options",
-        ),
-        ([[-1, -1], [-1, -1]], "labels/phase is -1 at every step of the demonstrations to train with"),
-    ],
+    ("labels", "message"), [([[0, 1, 2], [0, 1, 2]], MANY), ([[-1, -1], [-1, -1]], NONE)]
 )
 def test_labels_that_cannot_be_used_are_one_line(labels, message):
     demos = random_demonstrations(labels)
@@ -146,7 +141,7 @@ def test_labels_that_cannot_be_used_are_one_line(labels, message):
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_the_clusters_of_labelled_options_start_from_their_steps(order):
-    """Three places far apart; a step of each has a label, or of two of them: then the third cluster is the third."""
+    """Three places far apart; a step of each has a label, or of two of them: then the third cluster is 3."""
     places = np.array([[0.0, 9.0], [9.0, 0.0], [0.0, 0.0]])
     truth = np.arange(12) % 3
     states = places[truth] + 0.1 * np.random.default_rng(0).normal(size=(12, 2))
@@ -157,16 +152,15 @@ def test_the_clusters_of_labelled_options_start_from_their_steps(order):
 
 
 def test_labels_of_every_option_name_the_other_steps():
-    """Two options side by side along a way that both have gone: what is nearest to the mean of either says little."""
+    """Two options side by side along a way that both have gone: being nearest to a mean says little."""
     random, truth = np.random.default_rng(0), np.arange(400) % 3 + 1
     along = random.uniform(-10, 10, 400)
     states = np.column_stack(
         [along, np.select([truth == 1, truth == 2], [0.0, 1.0], 9.0) + 0.1 * random.normal(size=400)]
     )
     labels = np.where((along > 0) | (np.arange(400) > 200), -1, truth)  # of the near half of the first ones
-    labels[np.flatnonzero(truth == 2)[:3]] = (
-        2  # and of a few others, so that the means are apart along the way
-    )
+    # and of a few others, so that the means are apart along the way
+    labels[np.flatnonzero(truth == 2)[:3]] = 2
     means = np.stack([states[labels == option].mean(0) for option in (1, 2, 3)])
     nearest = np.linalg.norm(states[:, None] - means, axis=-1).argmin(1) + 1
     assert (nearest == truth).mean() < 0.9
@@ -191,13 +185,12 @@ WIDTHS = 1, 2
 
 def window(rows, width, past=False):
     """Means over windows that are cut at the ends, one after another."""
-    return np.stack(
-        [rows[max(t - width, 0) : t + 1 + (0 if past else width)].mean(0) for t in range(len(rows))]
-    )
+    ends = [t + 1 + (0 if past else width) for t in range(len(rows))]
+    return np.stack([rows[max(t - width, 0) : end].mean(0) for t, end in enumerate(ends)])
 
 
 def features(demo, mean=None):
-    """Those of a demonstration that are not standardised; of the past with the mean of controls before the first."""
+    """Those of a demonstration, not standardised; of the past with the mean of controls before the first."""
     past = mean is not None
     actions = np.concatenate([mean[None], demo.actions[:-1]]) if past else demo.actions
     rows = np.concatenate([demo.observations["state"], actions], axis=1)
@@ -206,7 +199,7 @@ def features(demo, mean=None):
 
 @pytest.fixture(scope="module")
 def recognised():
-    """Demonstrations, of which some have labels of two of three options, and a trainer with a recogniser of them."""
+    """Demonstrations, some with labels of two of three options, and a trainer with a recogniser of them."""
     random = np.random.default_rng(3)
     phases = [[5, 5, -1, 9, 9], [-1] * 4, [9, 9, 5, 5, 5, -1], [-1] * 5, [5, 9, 5], [-1] * 6]
 
@@ -247,9 +240,8 @@ def test_it_is_the_regression_of_scikit_learn_on_windows(recognised, past):
     for demo, own in zip(demos, ratio.numpy(), strict=True):
         expected = np.maximum(truth.predict_log_proba(features(demo, mean)), -12) - np.log(share)
         np.testing.assert_allclose(own[: len(demo), 1:3], expected, atol=1e-4)
-        np.testing.assert_array_equal(
-            own[: len(demo), [0, 3]], 0.0
-        )  # of control, and of the option without labels
+        # of control, and of the option without labels
+        np.testing.assert_array_equal(own[: len(demo), [0, 3]], 0.0)
 
 
 def test_evidence_is_a_factor_of_every_path(recognised):
@@ -271,14 +263,13 @@ def test_evidence_is_a_factor_of_every_path(recognised):
 
 
 def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
-    """Two skills that move alike at every single step, at places that differ by person: only what is around tells."""
+    """Two skills alike at every single step, at places that differ by person: only what is around tells."""
     random = np.random.default_rng(0)
 
     def one(number):
         phase = np.repeat([0, 1, 0, 1], random.integers(12, 18, 4))
-        fast = np.sin(np.arange(len(phase)) * np.where(phase, 2.4, 0.3))[:, None] + random.normal(
-            size=(len(phase), 1)
-        )
+        waves = np.sin(np.arange(len(phase)) * np.where(phase, 2.4, 0.3))[:, None]
+        fast = waves + random.normal(size=(len(phase), 1))
         drift = np.where(phase, 1.0, -1.0)[:, None] + 1.5 * random.normal(size=(len(phase), 1))
         known = phase if number < 3 else np.full_like(phase, -1)
         return (
@@ -294,9 +285,8 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
         labels = {"level": "level-1", "from": "known", **({"recogniser": own} if own else {})}
         training = {"optimizer": {"name": "em"}, "labels": labels, "epochs": 40}
         read = {"path": "unused.hdf5", "labels": "phase"}
-        spec = small_spec(
-            (2,), training=training, demonstrations=read, compare_with=["mixture"] if own else []
-        )
+        compared = ["mixture"] if own else []
+        spec = small_spec((2,), training=training, demonstrations=read, compare_with=compared)
         fit = ddco_pyro.fit(spec, train, out=tmp_path / name)
         paths = [*fit.segment(held_out)[0]]
         truth = [demo.labels["phase"] + 1 for demo in held_out]
@@ -312,11 +302,8 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
         np.testing.assert_array_equal(own, other)
     mixture = again.baselines["mixture"]
     shared = mixture.spec.training.labels.recogniser
-    assert (mixture.spec.control.power, shared.weight, shared.ridge) == (
-        chosen.power,
-        chosen.weight,
-        chosen.ridge,
-    )
+    used = (mixture.spec.control.power, shared.weight, shared.ridge)
+    assert used == (chosen.power, chosen.weight, chosen.ridge)
     assert float(mixture.hierarchy.recogniser.gamma) == chosen.weight
     said = contributions(again.metrics.training)
     assert max(map(sum, said.values())) == sum(said["labels, recogniser and policies, as chosen"])
@@ -327,7 +314,7 @@ def test_a_recogniser_places_what_labels_alone_do_not(tmp_path):
 
 
 def test_a_recogniser_reads_pictures():
-    """Planted: the half of a noisy picture that is brighter says which option is active; two demonstrations tell it."""
+    """Planted: the brighter half of a noisy picture is the active option; two demonstrations tell it."""
     random = np.random.default_rng(5)
 
     def one(number):
@@ -339,11 +326,8 @@ def test_a_recogniser_reads_pictures():
         return seen, random.normal(size=(len(phase), 2)), {"phase": known, "truth": phase}
 
     demos = numbered(one(number) for number in range(6))
-    conv = {
-        "network": "conv",
-        "layers": [{"filters": 2, "kernel": 3, "stride": 2, "padding": 1}],
-        "hidden": [3],
-    }
+    layers = [{"filters": 2, "kernel": 3, "stride": 2, "padding": 1}]
+    conv = {"network": "conv", "layers": layers, "hidden": [3]}
     labels = {"level": "level-1", "from": "phase", "recogniser": RECOGNISER}
     seen = ["state", "camera"]
     level = {"name": "level-1", "count": 2, "policy": conv, "termination": {**LINEAR, "inputs": ["state"]}}
@@ -354,9 +338,8 @@ def test_a_recogniser_reads_pictures():
     features = reads.features(batch.inputs, batch.actions, batch.lengths)
     found = model.recogniser.options(batch)
     for demo, rows, options in zip(demos, features.numpy(), found.numpy(), strict=True):
-        brightness = (
-            demo.observations["camera"].reshape(len(demo), 8, 8, 2).mean(-1).reshape(len(demo), 64) / 255
-        )
+        pictures = demo.observations["camera"].reshape(len(demo), 8, 8, 2)
+        brightness = pictures.mean(-1).reshape(len(demo), 64) / 255
         np.testing.assert_allclose(rows[: len(demo), 2:66], brightness, atol=1e-6)
         np.testing.assert_allclose(rows[: len(demo), 70:134], window(brightness, 2), atol=1e-6)
         assert (options[: len(demo)] == demo.labels["truth"] + 1).mean() > 0.9
@@ -366,7 +349,7 @@ def test_a_recogniser_reads_pictures():
 
 
 def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
-    """Held-out segments have the numbers of the labels, whichever those are; the options 1 to 3 of the truth do not."""
+    """Held-out segments have the numbers of the labels, whichever those are; the truth's options do not."""
     names = [30, 10, 20]
     training = {"epochs": 160, "patience": 15, "starts": ["vq"], "optimizer": {"lr": 0.03}}
     labels = {"level": "level-1", "from": "phase"}
@@ -375,9 +358,8 @@ def test_three_labelled_demonstrations_name_the_options_of_thirty(tmp_path):
     demos, choices = plant(truth, 30, 24, seed=1)
     phases = np.array(names)[choices[..., 0].numpy() - 1]
     phases[3:] = -1
-    demos = Demonstrations(
-        tuple(replace(demo, labels={"phase": row}) for demo, row in zip(demos, phases, strict=True))
-    )
+    pairs = zip(demos, phases, strict=True)
+    demos = Demonstrations(tuple(replace(demo, labels={"phase": row}) for demo, row in pairs))
     held_out, true = plant(truth, 20, 24, seed=11)
     model = make_trainer(in_units_of(spec, demos), demos, tmp_path).run()
     tables, batch = tabulated(model, held_out)
@@ -399,7 +381,9 @@ def files(tmp_path):
         f"""
 demonstrations: {{path: {tmp_path / "demos.hdf5"}}}
 observations: [state]
-hierarchy: {{levels: [{{name: skill, count: 3, policy: {{network: linear}}}}], meta_policy: {{network: linear}}}}
+hierarchy:
+  levels: [{{name: skill, count: 3, policy: {{network: linear}}}}]
+  meta_policy: {{network: linear}}
 compare_with: [{{kind: flat, policy: {{network: linear}}}}]
 training: {{epochs: 3, labels: {{level: skill, from: phase}}}}
 """
@@ -419,10 +403,8 @@ def test_a_start_that_does_not_follow_labels_is_warned_of(files, start):
 
 def test_a_run_says_for_which_labels_its_options_stand(files):
     output = call("check", files / "mine.yaml").out
-    assert (
-        "labels/phase, level 'skill': phase 0 is option 1, phase 2 is option 2; used of 3 demonstrations"
-        in output
-    )
+    says = "labels/phase, level 'skill': phase 0 is option 1, phase 2 is option 2; used of 3 demonstrations"
+    assert says in output
     call("fit", files / "mine.yaml", "--out", files / "run")
     said = json.loads((files / "run" / "metrics.json").read_text())["trained_labels"]
     assert (said["level"], said["labels"], said["values"]) == ("skill", "phase", [0, 2])
@@ -450,9 +432,10 @@ def test_a_run_says_for_which_labels_its_options_stand(files):
 # --- labels of several levels -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("labels", "names"), [(["phase", "half"], ["phase", "half"]), ("half", ["half", "half"])]
-)
+BOTH = [(["phase", "half"], ["phase", "half"]), ("half", ["half", "half"])]
+
+
+@pytest.mark.parametrize(("labels", "names"), BOTH)
 def test_each_level_is_measured_with_its_own_labels(tmp_path, labels, names):
     random, phase = np.random.default_rng(0), np.repeat([0, 1, 2, 3], 4)
     own = {"phase": phase, "half": np.where(np.arange(16) == 8, -1, phase // 2)}
@@ -474,6 +457,5 @@ def test_each_level_is_measured_with_its_own_labels(tmp_path, labels, names):
     demos.write(tmp_path / "demos.hdf5")
     done("segment", fit.folder, tmp_path / "demos.hdf5", "--html", tmp_path / "page.html")
     shown = (tmp_path / "page.html").read_text()
-    assert [shown.count(f"Agreement with the label “{name}”") for name in names] == [
-        names.count(one) for one in names
-    ]
+    found = [shown.count(f"Agreement with the label “{name}”") for name in names]
+    assert found == [names.count(one) for one in names]

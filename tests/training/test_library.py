@@ -1,4 +1,4 @@
-"""The prior that a library is: closed forms, EM against the Pyro program, and a new task from one demonstration."""
+"""The prior that a library is: closed forms, EM against the Pyro program, a task from one demonstration."""
 
 import copy
 from functools import partial
@@ -56,9 +56,8 @@ def test_a_linear_policy_ends_at_ridge_regression_centred_at_the_library(per_opt
     batch = make_batch(6, 9)
     converged(Expectation(model, EVERYTHING, score, RidgeSpec(), prior=Prior(library, 30.0, 20.0)), batch)
     alive = torch.arange(9) < batch.lengths[:, None]
-    x = np.column_stack([batch.inputs.vectors["state"][alive].numpy(), np.ones(int(alive.sum()))]).astype(
-        float
-    )
+    states = batch.inputs.vectors["state"][alive].numpy()
+    x = np.column_stack([states, np.ones(int(alive.sum()))]).astype(float)
     actions = batch.actions[alive].double().numpy()
     (layer,), (center,) = (one.meta_policy.network.layers for one in (model, library))
     w0 = torch.cat([center.weight, center.bias], 1)[0].detach().double().numpy()
@@ -81,29 +80,22 @@ def test_without_a_prior_of_sigma_it_collapses():
     found = {}
     for spread in (1e-9, 20.0):
         model = copy.deepcopy(library)
-        converged(
-            Expectation(model, EVERYTHING, score, RidgeSpec(), prior=Prior(library, 1000.0, spread)), batch
-        )
+        known = Prior(library, 1000.0, spread)
+        converged(Expectation(model, EVERYTHING, score, RidgeSpec(), prior=known), batch)
         found[spread] = float(model.meta_policy.std.table().detach().max())
     assert found[1e-9] < 0.02  # the floor is 0.01
     assert found[20.0] > 0.2
 
 
-KINDS = {
-    "gaussian": None,
-    "clipped": CLIPPED,
-    "mixed": MIXED,
-    "actions": ACTIONS,
-    "student": STUDENT,
-    "hurdle": HURDLE,
-}
+KINDS = {"gaussian": None, "clipped": CLIPPED, "mixed": MIXED, "actions": ACTIONS}
+KINDS |= {"student": STUDENT, "hurdle": HURDLE}
+
+
+STDS = [((2, 3), LEARNED), ((2,), LEARNED | {"per_option": True}), ((), LEARNED | {"per_state": True})]
 
 
 @pytest.mark.parametrize("parts", KINDS.values(), ids=KINDS)
-@pytest.mark.parametrize(
-    ("counts", "std"),
-    [((2, 3), LEARNED), ((2,), LEARNED | {"per_option": True}), ((), LEARNED | {"per_state": True})],
-)
+@pytest.mark.parametrize(("counts", "std"), STDS)
 def test_em_has_the_prior_of_the_program(parts, std, counts):
     """Differences between two models: densities have constants of their own."""
     model = linear(counts, parts, emits=("options", "control"), std=std, power=0.5)
@@ -131,9 +123,8 @@ def test_the_program_with_likelihood_has_em_s_objective():
 
 def planted(**training):
     """A library's truth of four corners, and a new task whose two first corners lie nearer."""
-    spec = with_overrides(
-        make_spec((4,), control=CONTROL), {"training.optimizer": {"name": "em"}, **training}
-    )
+    by_em = {"training.optimizer": {"name": "em"}, **training}
+    spec = with_overrides(make_spec((4,), control=CONTROL), by_em)
     library, new = make_truth(spec), make_truth(spec)
     with torch.no_grad():
         new.levels[0].policy.network.layers[0].bias[:2] *= 0.7
@@ -141,7 +132,7 @@ def planted(**training):
 
 
 def test_a_new_task_is_learned_from_one_demonstration():
-    """Held-out nats per step: nearer to the truth's than to those of the library, and than those from scratch."""
+    """Held-out nats per step: nearer to the truth's than to those of the library, and those from scratch."""
     spec, library, truth = planted()
     first, _ = plant(truth, 1, 60, seed=5)
     held_out, _ = plant(truth, 40, 30, seed=2)
@@ -151,8 +142,8 @@ def test_a_new_task_is_learned_from_one_demonstration():
     prior = Prior(library, 3.0, 20.0)
     adapted = train_model(drawn, size.like(library, "known"), first, library=prior).hierarchy
     scratch = train_model(in_units_of(spec, first), size, first).hierarchy
-    value = {name: per_step(one, tabulated(one, held_out)[1]) for name, one in
-             {"truth": truth, "library": library, "adapted": adapted, "scratch": scratch}.items()}  # fmt: skip
+    models = {"truth": truth, "library": library, "adapted": adapted, "scratch": scratch}
+    value = {name: per_step(one, tabulated(one, held_out)[1]) for name, one in models.items()}
     assert value["adapted"] > value["truth"] - 0.5
     assert value["adapted"] > max(value["library"], value["scratch"]) + 0.5
 
@@ -161,9 +152,8 @@ def test_a_ridge_of_0_leaves_the_weights_alone():
     """They begin by `starts`; encoder, scaling and the prior of σ are the library's."""
     spec, library, truth = planted()
     demos, _ = plant(truth, 4, 30, seed=1)
-    spec = with_overrides(
-        spec, {"training.library": {"run": "known", "ridge": 0, "spread": 5}, "training.epochs": 20}
-    )
+    known = {"run": "known", "ridge": 0, "spread": 5}
+    spec = with_overrides(spec, {"training.library": known, "training.epochs": 20})
     trainer = Trainer(spec, Dimensions.of(demos), demos, demos, library=Prior(library, 0.0, 5.0))
     trainer.check_engines()
     trainer.run()
@@ -175,12 +165,10 @@ def test_a_ridge_of_0_leaves_the_weights_alone():
 
 def test_perceptrons_end_where_likelihood_and_prior_balance():
     """The gradient of their sum is 0 at the end of L-BFGS, whose own weights have moved."""
-    spec = small_spec(
-        (), {"network": "mlp", "hidden": [4]}, training={"optimizer": {"name": "em"}, "epochs": 400}
-    )
-    spec = with_overrides(
-        spec, {"training.tune_fraction": 0, "control.std": LEARNED, "training.patience": None}
-    )
+    training = {"optimizer": {"name": "em"}, "epochs": 400}
+    spec = small_spec((), {"network": "mlp", "hidden": [4]}, training=training)
+    changes = {"training.tune_fraction": 0, "control.std": LEARNED, "training.patience": None}
+    spec = with_overrides(spec, changes)
     demos, _ = plant(planted()[1], 6, 20, seed=1)
     size = Dimensions.of(demos)
     library = train_model(spec, size, demos).hierarchy

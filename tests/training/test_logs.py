@@ -36,9 +36,8 @@ def history(run: Path) -> dict[str, list[tuple[int, float]]]:
     for folder, model in ((run, "ddco"), (run / "baselines" / "flat", "flat")):
         for row in csv.DictReader((folder / "history.csv").open()):
             for part in ("train", "tune"):
-                found.setdefault(f"{model}/{row['stage']}/{part}", []).append(
-                    (int(row["epoch"]), float(row[part]))
-                )
+                point = (int(row["epoch"]), float(row[part]))
+                found.setdefault(f"{model}/{row['stage']}/{part}", []).append(point)
     return found
 
 
@@ -87,27 +86,20 @@ def test_restarts_have_names_of_their_own_and_numbers_are_finite(tmp_path, monke
     ]
 
 
-def test_the_fit_goes_on_where_a_log_fails(
-    spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_fit_goes_on_where_a_log_fails(spec: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(LOGS, "tensorboard", (Kept(fails=2), "ddco_pyro"))
     ended = done("fit", spec, "--out", tmp_path / "run", "--log", "tensorboard")
     assert ended.out.count("the fit goes on without this log") == 1
 
 
-def test_what_is_no_log_is_refused_in_a_line(
-    spec: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_log_is_refused_in_a_line(spec: Path, tmp_path: Path, monkeypatch) -> None:
     for name, package in {"tensorbord": "", **{name: package for name, (_, package) in LOGS.items()}}.items():
         monkeypatch.setitem(sys.modules, package, None)
         ended = call("fit", spec, "--out", tmp_path / "run", "--log", name)
         assert (ended.status, ended.err.count("\n")) == (2, 1)
         said = f"--log {name}: needs {package}; install it with: pip install 'ddco-pyro[{package}]'"
-        said = (
-            said
-            if package
-            else "there is no log 'tensorbord' (did you mean 'tensorboard'?); there is: tensorboard"
-        )
+        unknown = "there is no log 'tensorbord' (did you mean 'tensorboard'?); there is: tensorboard"
+        said = said if package else unknown
         assert said in ended.err
         assert not (tmp_path / "run").exists()
 
@@ -123,9 +115,8 @@ def test_tensorboards_own_reader_reads_the_history(spec: Path, tmp_path: Path) -
     expected = history(run) | {name: [(0, value)] for name, value in held_out(run).items()}
     assert set(read.Tags()["scalars"]) == set(expected)
     for name, values in expected.items():
-        np.testing.assert_allclose(
-            [(event.step, event.value) for event in read.Scalars(name)], values, rtol=1e-5
-        )
+        found = [(event.step, event.value) for event in read.Scalars(name)]
+        np.testing.assert_allclose(found, values, rtol=1e-5)
 
 
 @pytest.mark.slow

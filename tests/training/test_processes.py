@@ -1,4 +1,4 @@
-"""Several processes that share each gradient step: the same bits for any number, after a kill too, and no hang."""
+"""Several processes that share each gradient step: the same bits for any number, after a kill, no hang."""
 
 import json
 import os
@@ -133,7 +133,7 @@ def under_torchrun(folder, *arguments, other=lambda: None):
 
 
 WAIT = 30.0
-"""Seconds after the first process within which the other has to end; it takes a tenth of one on an idle machine."""
+"""Seconds after the first process within which the other has to end; a tenth of one on an idle machine."""
 
 
 def test_a_finished_run_keeps_no_process_of_torchrun_waiting(whole, tmp_path):
@@ -211,10 +211,10 @@ def test_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path, number, tra
 
 
 def test_more_processes_than_shards_are_refused(whole, tmp_path):
-    first, other = under_torchrun(
-        tmp_path, "fit", whole[0], "--set", "training.shards=1", "--out", tmp_path / "run"
-    )
-    said = "torchrun started 2 processes, but a minibatch is cut into training.shards=1; add --set training.shards=2"
+    asked = ("fit", whole[0], "--set", "training.shards=1", "--out", tmp_path / "run")
+    first, other = under_torchrun(tmp_path, *asked)
+    said = "torchrun started 2 processes, but a minibatch is cut into training.shards=1; add --set "
+    said += "training.shards=2"
     assert (first.status, first.err.count("\n"), said in first.err) == (2, 1, True)
     assert other == (0, "", "")
     assert not (tmp_path / "run").exists()

@@ -1,4 +1,4 @@
-"""Restarts: every way to begin is tried, the likeliest in training is kept, and no hierarchy is below its mixture."""
+"""Restarts: every way to begin is tried, the likeliest in training is kept, none is below its mixture."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def spec():
 
 @pytest.fixture(scope="module", autouse=True)
 def early():
-    """Restarts are compared after three epochs of gradient steps, and stopped where they are little behind."""
+    """Restarts are compared after three epochs of gradient steps, and stopped where a little behind."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(restarting, "BY_GRADIENT", 3)
         patch.setattr(restarting, "BEHIND", 0.01)
@@ -72,7 +72,7 @@ def assert_same(trainer, model, folder, undisturbed):
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_same_bits_also_where_one_had_begun(
+def test_two_processes_give_the_same_bits_where_one_had_begun(
     undisturbed, spec, demos, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
@@ -87,9 +87,8 @@ def interrupted(trainer):
 
 
 def test_em_that_is_interrupted_begins_its_restart_again_and_gives_the_same_bits(demos, tmp_path):
-    spec = make_spec(
-        (2,), starts=["vq", "mixture"], control={"std": 1.0}, optimizer={"name": "em"}, epochs=20
-    )
+    training = {"starts": ["vq", "mixture"], "optimizer": {"name": "em"}, "epochs": 20}
+    spec = make_spec((2,), control={"std": 1.0}, **training)
     whole = trained(spec, demos, tmp_path / "whole")
     for epochs in (3, 30):
         folder = tmp_path / str(epochs)
@@ -102,7 +101,7 @@ def test_em_that_is_interrupted_begins_its_restart_again_and_gives_the_same_bits
 
 
 class Scripted:
-    """Restarts whose objectives were written down before: after the first epochs, and at the end; −∞ diverged."""
+    """Restarts whose objectives were written down: after the first epochs, and at the end; −∞ diverged."""
 
     def __init__(self, sounded, ends):
         self.sounded, self.ends = sounded, ends
@@ -123,9 +122,7 @@ ENDED = {"stage": "joint", "epochs": 20, "cap": None, "rising": 0.0, "over": 1, 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_those_far_behind_are_stopped_and_the_likeliest_of_the_others_is_kept(
-    demos, tmp_path, monkeypatch, seed
-):
+def test_those_far_behind_are_stopped_and_the_likeliest_is_kept(demos, tmp_path, monkeypatch, seed):
     random = np.random.default_rng(seed)
     number, margin = int(random.integers(2, 7)), float(random.choice([0.0, 0.02]))
     sounded, ends = random.normal(0, 0.02, (2, number)).round(3)
@@ -144,9 +141,8 @@ def test_those_far_behind_are_stopped_and_the_likeliest_of_the_others_is_kept(
     restarts = trainer.summary["restarts"]
     assert restarts["best"] == expected
     assert [each["start"] for each in restarts["each"]] == starts
-    assert [each["objective"] for each in restarts["each"]] == [
-        None if n in behind else ends[n] for n in range(number)
-    ]
+    objectives = [None if n in behind else ends[n] for n in range(number)]
+    assert [each["objective"] for each in restarts["each"]] == objectives
     kept = trainer.data.hierarchy(expected).state_dict()
     assert all(torch.equal(model[name], value) for name, value in kept.items())
 
@@ -159,18 +155,11 @@ def test_the_objective_has_the_ridges_log_prior(demos, tmp_path):
     trainer = make_trainer(spec, demos, tmp_path)
     model, batch = trainer.run(), trainer.data.train
     (level,) = model.option_levels()
-    networks = [
-        ("policy", level.policy.network),
-        ("gate", level.termination),
-        ("gate", model.meta_policy.network),
-    ]
-    squares = [
-        (name, float(network.layers[-1].weight.detach().double().square().sum()))
-        for name, network in networks
-    ]
-    biases = 1e-6 * sum(
-        float(network.layers[-1].bias.detach().double().square().sum()) for _, network in networks
-    )
+    gates = [("gate", level.termination), ("gate", model.meta_policy.network)]
+    networks = [("policy", level.policy.network), *gates]
+    lasts = [(name, network.layers[-1]) for name, network in networks]
+    squares = [(name, float(last.weight.detach().double().square().sum())) for name, last in lasts]
+    biases = 1e-6 * sum(float(last.bias.detach().double().square().sum()) for _, last in lasts)
     value = float(log_likelihood(model.tabulate(batch), batch.lengths).detach().sum())
     value -= 0.5 * (sum(ridge[name] * square for name, square in squares) + biases)
     assert trainer.objective == pytest.approx(value / batch.steps, abs=1e-5)
@@ -214,7 +203,7 @@ def test_segments_of_restarts_are_compared_with_the_best(demos, tmp_path):
 
 
 def diverging(passes, **training):
-    """Restarts of which those that begin with a positive weight have that many passes before they give NaN."""
+    """Restarts of which those with a positive weight at first have that many passes before they give NaN."""
     policy = {"network": "user_networks:Diverging", "options": {"passes": passes}}
     own = {"starts": ["random"] * 6, "epochs": 12, "patience": None, "tune_fraction": 0.2, **training}
     return small_spec((), policy, control={"std": 1.0}, training=own)
@@ -224,9 +213,8 @@ def diverging(passes, **training):
 def test_a_restart_that_diverges_ends_there_and_is_not_the_best(demos, tmp_path, passes):
     trainer, model, told, _ = trained(diverging(passes), demos, tmp_path)
     ended = [number for number, each in enumerate(trainer.summary["restarts"]["each"]) if each["diverged"]]
-    starts = [
-        trainer.data.hierarchy(number).meta_policy.network.module.weight[0, 0] > 0 for number in range(6)
-    ]
+    models = (trainer.data.hierarchy(number) for number in range(6))
+    starts = [model.meta_policy.network.module.weight[0, 0] > 0 for model in models]
     rows = [sum(row["restart"] == number for row in trainer.history) for number in range(6)]
     assert ended
     assert all(starts[number] and rows[number] == passes for number in ended)
@@ -236,9 +224,8 @@ def test_a_restart_that_diverges_ends_there_and_is_not_the_best(demos, tmp_path,
     reasons = {event.restart: event.why for event in told if isinstance(event, RestartDiverged)}
     assert sorted(reasons) == ended
     assert all(f"epoch {passes + 1}: the log-likelihood of demo_" in why for why in reasons.values())
-    assert f"; diverged: {', '.join(map(str, ended))}" in verdicts.restarts(
-        Training.model_validate(trainer.summary)
-    )
+    told = verdicts.restarts(Training.model_validate(trainer.summary))
+    assert f"; diverged: {', '.join(map(str, ended))}" in told
     made = training.train(trainer.data, Restart(Progress(best)))
     assert all(torch.equal(model[name], value) for name, value in made.states["best"].items())
 
@@ -253,9 +240,7 @@ def test_where_those_that_are_left_diverge_the_stopped_ones_go_on(demos, tmp_pat
 
 @pytest.mark.parametrize("restarts", [1, 3])
 def test_where_all_diverge_the_trajectory_is_named(demos, tmp_path, monkeypatch, restarts):
-    monkeypatch.setattr(
-        user_networks.Diverging, "forward", lambda self, inputs: _nan_in_training(self, inputs)
-    )
+    monkeypatch.setattr(user_networks.Diverging, "forward", _nan_in_training)
     for _ in range(2):  # also where all that is kept is read again
         with pytest.raises(
             TrainingError, match=r"^stage policy, epoch 1: the log-likelihood of demo_\d+.* is not finite"
@@ -272,7 +257,7 @@ def _nan_in_training(network, inputs):
 
 
 def memoryless(seed, number=12, steps=30):
-    """Controls of one of three laws, drawn anew at each step by where the state is: a mixture is the truth."""
+    """Controls of one of three laws, drawn at each step by where the state is: a mixture is the truth."""
     random = np.random.default_rng(seed)
     weights = 2.0 * random.normal(size=(3, 2, 1))
 
@@ -295,7 +280,7 @@ def contains(starts, **training):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_hierarchy_is_no_less_likely_in_training_than_its_mixture(seed, monkeypatch):
-    """Where its own start is worse, training goes on from the mixture; without that the bound is broken, and told."""
+    """Where its own start is worse, training goes on from the mixture; else the bound is broken, and told."""
     demos, spec = memoryless(seed), contains(["equal_parts"])
     with monkeypatch.context() as patch:
         patch.setattr(restarting.Trainer, "contain", lambda self, mixture, objective: self.hierarchy)

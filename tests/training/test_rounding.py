@@ -54,19 +54,11 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("low", "high", "dtype", "expected"),
     [
         ([1.0, -6e-7], [1.0, 6e-7], "float32", [True, True]),  # Meta-World's hand-insert and sweep-into
-        (
-            [1.0, -8.6e-6],
-            [1.0, 7.7e-6],
-            "float64",
-            [True, True],
-        ),  # its shelf-place, after 500 steps of a simulator
+        # its shelf-place, after 500 steps of a simulator
+        ([1.0, -8.6e-6], [1.0, 7.7e-6], "float64", [True, True]),
         ([1.0, -5e-5], [1.0, 5e-5], "float32", [True, False]),  # a tenth of a millimetre, or of a milliradian
-        (
-            [-6e-7, -1e-7],
-            [6e-7, 1e-7],
-            "float32",
-            [False, False],
-        ),  # nothing large beside it: a signal in small units
+        # nothing large beside it: a signal in small units
+        ([-6e-7, -1e-7], [6e-7, 1e-7], "float32", [False, False]),
         (
             [1e3, -1e-3],
             [1e3, 1e-3],
@@ -93,10 +85,8 @@ def test_inspect_says_so(path: Path) -> None:
     for key in ("place", "distance", "settled"):
         assert found.fields[f"obs/{key}"].rounding == []
     assert found.fields["actions"].rounding == []
-    rows = {
-        line.split("│")[0].strip(): line.split("│")[-1].strip()
-        for line in call("inspect", path).out.splitlines()
-    }
+    lines = [line.split("│") for line in call("inspect", path).out.splitlines()]
+    rows = {cells[0].strip(): cells[-1].strip() for cells in lines}
     assert rows["obs/resting"] == "constant up to rounding"
     assert rows["obs/half"] == "constant up to rounding: 1"
     fields = {field["place"]: field for field in json.loads(call("inspect", path, "--json").out)["fields"]}
@@ -111,9 +101,8 @@ def test_init_leaves_them_out(path: Path) -> None:
 
 def features(key: str, differences: bool = False, demos: Demonstrations = DEMOS) -> np.ndarray:
     """What networks see of an observation in all steps, [steps, F]."""
-    encoder = ObservationEncoder(
-        [ObservationSpec(key=key, differences=differences)], demos.observation_shapes
-    )
+    observed = ObservationSpec(key=key, differences=differences)
+    encoder = ObservationEncoder([observed], demos.observation_shapes)
     encoder.fit(demos)
     return encoder.inputs(demo.observations for demo in demos).vector.flatten(0, 1).numpy()
 

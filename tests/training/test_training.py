@@ -49,17 +49,11 @@ def test_stages_go_from_the_lowest_level_up(training, depth, names):
 
 def lines(**training):
     """Ten demonstrations along a line, cut into three equal parts, and how they are fitted."""
-    line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + np.random.default_rng(0).normal(
-        0, 0.02, (10, 12, 2)
-    )
+    noise = np.random.default_rng(0).normal(0, 0.02, (10, 12, 2))
+    line = np.linspace(-1, 1, 12)[:, None] * [1.0, 0.0] + noise
     demos = numbered(({"state": one}, one) for one in line)
-    own = {
-        "starts": ["equal_parts"],
-        "layerwise": False,
-        "optimizer": {"lr": 0.1},
-        "epochs": 800,
-        "patience": None,
-    }
+    own = {"starts": ["equal_parts"], "layerwise": False, "optimizer": {"lr": 0.1}}
+    own |= {"epochs": 800, "patience": None}
     return make_trainer(make_spec((3,), **own, **training), demos, None).data
 
 
@@ -92,9 +86,8 @@ def test_learning_rates_fall_along_half_a_cosine(tmp_path, monkeypatch):
 
     monkeypatch.setattr(torch.optim, "Adam", Adam)
     optimizer = {"lr": 0.01, "schedule": "cosine"}
-    trainer = make_trainer(
-        make_spec(epochs=40, patience=None, optimizer=optimizer), of_states([8] * 10), tmp_path
-    )
+    spec = make_spec(epochs=40, patience=None, optimizer=optimizer)
+    trainer = make_trainer(spec, of_states([8] * 10), tmp_path)
     trainer.run()
     parameter, expected = torch.nn.Parameter(torch.zeros(1)), []
     for epochs in epochs_of(trainer).values():
@@ -137,7 +130,7 @@ def test_stages_share_the_budget_and_what_one_leaves_goes_to_the_later_ones(tmp_
 
 @pytest.mark.parametrize(("name", "apart"), [("adamw", True), ("adam", False)])
 def test_weight_decay_of_adamw_is_apart_from_the_gradient(name, apart, tmp_path):
-    """In the first step it takes as much more of every weight as it is larger; a penalty is lost in Adam's scaling."""
+    """In the first step it takes as much more of every weight as it is larger; Adam would lose a penalty."""
     settings = {"control": {"std": 1.0}, "starts": ["random"], "layerwise": False, "epochs": 1}
     after = []
     for decay in (0.0, 1.0, 2.0):
@@ -163,9 +156,8 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
 
     monkeypatch.setattr(StageTraining, "step", step)
     monkeypatch.setattr(Objective, "tune", tune)
-    final = make_trainer(
-        make_spec((), average=decay, epochs=3, batch_size=4), of_states([8] * 10), tmp_path
-    ).run()
+    spec = make_spec((), average=decay, epochs=3, batch_size=4)
+    final = make_trainer(spec, of_states([8] * 10), tmp_path).run()
     assert (len(steps), len(shown)) == (3 * 2, 1 + 3)
     for epoch, seen in enumerate(shown[1:], start=1):
         taken = steps[: 2 * epoch]
@@ -181,29 +173,24 @@ def test_the_running_mean_of_the_weights_is_evaluated_and_kept(tmp_path, monkeyp
     assert any(not torch.equal(value, steps[-1][name]) for name, value in final.named_parameters())
 
 
-@pytest.mark.parametrize(
-    ("optimizer", "training", "rows"),
-    [
-        ("adam", {"epochs": 12}, 2 * 6 * 2),
-        pytest.param("momentum", {"epochs": 18}, 2 * 6 * 3, marks=pytest.mark.slow),
-        pytest.param("adam", {"epochs": 30, "patience": 1}, None, marks=pytest.mark.slow),
-        pytest.param("adam", {"epochs": 10, "layerwise": "segments"}, 2 * 5 * 2, marks=pytest.mark.slow),
-        pytest.param("adam", {"epochs": 12, "average": 0.9}, 2 * 6 * 2, marks=pytest.mark.slow),
-        ("adam", {"epochs": 12, "starts": ["equal_parts", "mixture"]}, 12 + 12),
-    ],
-    ids=[
-        "adam",
-        "momentum",
-        "stages that stop early",
-        "levels from segments",
-        "mean weights",
-        "starts that differ",
-    ],
-)
+def slowly(name, rows, **training):
+    return pytest.param(name, training, rows, marks=pytest.mark.slow)
+
+
+RESUMED = {
+    "adam": ("adam", {"epochs": 12}, 2 * 6 * 2),
+    "momentum": slowly("momentum", 2 * 6 * 3, epochs=18),
+    "stages that stop early": slowly("adam", None, epochs=30, patience=1),
+    "levels from segments": slowly("adam", 2 * 5 * 2, epochs=10, layerwise="segments"),
+    "mean weights": slowly("adam", 2 * 6 * 2, epochs=12, average=0.9),
+    "starts that differ": ("adam", {"epochs": 12, "starts": ["equal_parts", "mixture"]}, 12 + 12),
+}
+
+
+@pytest.mark.parametrize(("optimizer", "training", "rows"), RESUMED.values(), ids=RESUMED)
 def test_resuming_gives_the_same_bits(tmp_path, optimizer, training, rows):
-    spec = make_spec(
-        (2, 2), optimizer={"name": optimizer, "lr": 0.01}, **({"starts": ["vq", "vq"]} | training)
-    )
+    own = {"starts": ["vq", "vq"]} | training
+    spec = make_spec((2, 2), optimizer={"name": optimizer, "lr": 0.01}, **own)
     demos = of_states([8] * 10)
     whole = make_trainer(spec, demos, tmp_path / "whole")
     expected = whole.run().state_dict()
@@ -267,10 +254,9 @@ def test_what_is_called_converged_is_at_the_optimum(tmp_path):
         for p in (train, tune)
     ]
     actions = [np.concatenate([d.actions for d in p]) for p in (train, tune)]
-    error, std = (
-        actions[1] - states[1] @ np.linalg.lstsq(states[0], actions[0], rcond=None)[0],
-        0.5 * actions[0].std(0),
-    )
+    slopes = np.linalg.lstsq(states[0], actions[0], rcond=None)[0]
+    std = 0.5 * actions[0].std(0)
+    error = actions[1] - states[1] @ slopes
     optimum = (-0.5 * (error / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)).sum(1).mean()
     below = {}
     for epochs in (15, 400):
@@ -299,9 +285,8 @@ def test_a_planted_hierarchy_is_recovered_from_the_likeliest_of_several_starts(t
     segments = trainer.restarts[0].states["best"], trainer.restarts[1].states["best"]
     assert any(not torch.equal(segments[0][name], segments[1][name]) for name in segments[0])
     told = trainer.summary["restarts"]
-    assert [each["nmi"] is not None for each in told["each"]] == [
-        number != told["best"] for number in range(4)
-    ]
+    others = [number != told["best"] for number in range(4)]
+    assert [each["nmi"] is not None for each in told["each"]] == others
 
 
 @pytest.mark.parametrize(
@@ -322,14 +307,12 @@ def test_a_hierarchy_begins_from_the_mixtures_fit_with_psi_one_half(tmp_path, co
     always = {f"hierarchy.levels.{n}.termination": "always" for n in range(len(counts))}
     mixture = replace(data, spec=with_overrides(spec, always)).hierarchy(0)
     mixture.load_state_dict({name: begun[name] for name in mixture.state_dict()})
-    assert [torch.allclose(ends, torch.tensor(0.5)) for ends in psi(model, data.train)] == [True] * len(
-        counts
-    )
+    half = [torch.allclose(ends, torch.tensor(0.5)) for ends in psi(model, data.train)]
+    assert half == [True] * len(counts)
     without = [per_step(mixture, batch) for batch in (data.train, data.tune)]
     tuned = [row["tune"] for row in restart.progress.history if row["stage"] == "mixture"]
-    kept = (
-        tuned[-1] if optimizer["name"] == "em" else max(tuned)
-    )  # EM before the last stage keeps what converged
+    # EM before the last stage keeps what converged
+    kept = tuned[-1] if optimizer["name"] == "em" else max(tuned)
     assert kept == pytest.approx(without[1], abs=1e-5)
     restart = train(data, restart)
     assert restart.progress.ended[-1]["stage"] == "joint"
@@ -348,7 +331,7 @@ def psi(model, batch):
 @pytest.mark.slow
 @pytest.mark.parametrize("counts", [(4,), (4, 2)])
 def test_a_planted_hierarchy_is_recovered(tmp_path, counts):
-    """Held-out log-likelihood within 2 % of the truth's own, and segments that agree with the true options."""
+    """Held-out log-likelihood within 2 % of the truth's own, and segments that agree with true options."""
     spec = make_spec(
         counts, control=CONTROL, **(TRAINING if len(counts) > 1 else TRAINING | {"starts": ["vq_controls"]})
     )

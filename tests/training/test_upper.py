@@ -1,4 +1,4 @@
-"""Levels above the lowest start from what follows what: EM against sums over every path, planted ones found."""
+"""Levels above the lowest start from what follows what: EM against sums over every path, planted ones."""
 
 import itertools
 import math
@@ -64,7 +64,7 @@ def _count(h, b, weight, depth, selected, ended):
 
 
 def test_networks_are_scored_by_what_they_say_of_every_path_of_the_constants():
-    """Σ over paths of their probability under the constants times the log-probability of what they select and end."""
+    """Σ over paths of their probability under the constants times the log-probability of what happens."""
     counts, lengths = (2, 2), torch.tensor([STEPS, STEPS - 1])
     tables = random_tables(counts, (True, False), 2, STEPS, seed=5)
     constants = random_constants(tables)
@@ -98,7 +98,7 @@ def test_the_gradient_stays_finite_where_callers_have_no_control():
 
 
 def planted_pairs(demonstrations=20, steps=40, seed=0):
-    """Tables of what is seen of four options, a new one at each step; of two above, one selects 1 and 2, one 3, 4."""
+    """Tables of what is seen of four options, a new one each step; of two above, each selects two."""
     random = np.random.default_rng(seed)
     above = (
         np.cumsum(random.random((demonstrations, steps)) < 0.1, axis=1)
@@ -108,9 +108,8 @@ def planted_pairs(demonstrations=20, steps=40, seed=0):
     tables = random_tables((4, 2), (False, False), demonstrations, steps)
     ended = torch.tensor([-torch.inf, 0.0], dtype=torch.float64).expand(tables.termination[0].shape)
     control = torch.where(torch.tensor(seen)[..., None] == torch.arange(4), 0.0, -5.0).double()
-    return replace(
-        tables, termination=(ended, tables.termination[1]), control=(control, *tables.control[1:])
-    ), above
+    changes = {"termination": (ended, tables.termination[1]), "control": (control, *tables.control[1:])}
+    return replace(tables, **changes), above
 
 
 def test_a_planted_level_is_found():
@@ -119,9 +118,8 @@ def test_a_planted_level_is_found():
     constants = fitted([(tables, lengths)], 0)
     segments = segment(constants.within(tables), lengths)[1]
     assert normalized_mutual_info_score(above.flatten(), segments.flatten()) > 0.7
-    pairs = (
-        constants.selection[0].numpy().reshape(2, 2, 2).sum(-1)
-    )  # how often each selects 1 or 2, and 3 or 4
+    # how often each selects 1 or 2, and 3 or 4
+    pairs = constants.selection[0].numpy().reshape(2, 2, 2).sum(-1)
     np.testing.assert_allclose(np.sort(pairs.max(1)), 1.0, atol=0.05)
     assert pairs.argmax(1).tolist() in ([0, 1], [1, 0])
     np.testing.assert_allclose(constants.termination[0] * (1 - constants.selection[1][0]), 0.1, atol=0.04)

@@ -27,7 +27,7 @@ def demonstrations(path: Path, number: int = 6) -> h5py.File:
 
 
 def changed(change: Callable[..., None], *given: object, **named: object) -> Callable[[Path], Path]:
-    """Writes such a file, with something odd about ``demo_1``: a change of (its group, the folder, what is given)."""
+    """Writes such a file, with something odd about ``demo_1``: a change of (group, folder, the given)."""
 
     def make(folder: Path) -> Path:
         path = folder / "demos.hdf5"
@@ -59,9 +59,8 @@ def raw(group: h5py.Group, folder: Path) -> None:
     """Controls in a raw file."""
     (folder / "actions.raw").write_bytes(group["actions"][:].tobytes())
     del group["actions"]
-    group.create_dataset(
-        "actions", (STEPS, 2), "f8", external=[(str(folder / "actions.raw"), 0, STEPS * 2 * 8)]
-    )
+    place = [(str(folder / "actions.raw"), 0, STEPS * 2 * 8)]
+    group.create_dataset("actions", (STEPS, 2), "f8", external=place)
 
 
 def linked(group: h5py.Group, folder: Path, place: str, key: str) -> None:
@@ -136,26 +135,20 @@ SPEC = "demonstrations: {{path: {}}}\nobservations: [x]\nbaseline: {{kind: flat}
 REPACK = r"{}, which is not read; .*: h5repack --merge -l CONTI \S+ whole.hdf5"
 LINK = REPACK.format(r"demo_1.* is a link to {}")
 
+PLACE, CLAIMS = "/data/demo_0/obs/offsets", "demo_1: {} claims {} chunks, but the file holds {}"
 ROWS: dict[str, Row] = {
     "ordinary": Row(changed(lambda *_: None), None),
     "external storage": Row(changed(raw), REPACK.format("demo_1: actions is stored in another file")),
     "virtual": Row(changed(virtual), REPACK.format("demo_1: obs/offsets is virtual")),
-    "external link to an array": Row(
-        changed(linked, "/data/demo_0/obs/offsets", "data/demo_1/obs/offsets"),
-        LINK.format("/data/demo_0/obs/offsets"),
-    ),
+    "external link to an array": Row(changed(linked, PLACE, "data/demo_1/obs/offsets"), LINK.format(PLACE)),
     "external link to a demonstration": Row(
         changed(linked, "/data/demo_0", "data/demo_1"), LINK.format("/data/demo_0")
     ),
     "dangling link": Row(changed(soft, "data/demo_1", "demo_9"), LINK.format("demo_9")),
     "hard link": Row(changed(twice), None),
     "a group in itself": Row(changed(circle), "demo_1: obs/again: its groups go in a circle"),
-    "1e12 rows": Row(
-        changed(rows_claimed), "demo_1: actions claims 100000000 chunks, but the file holds 1; write"
-    ),
-    "a chunk missing": Row(
-        changed(chunk_missing), r"demo_1: obs/offsets claims 4 chunks, but the file holds 2"
-    ),
+    "1e12 rows": Row(changed(rows_claimed), CLAIMS.format("actions", 100000000, 1) + "; write"),
+    "a chunk missing": Row(changed(chunk_missing), CLAIMS.format("obs/offsets", 4, 2)),
     "a pipe": Row(partial(pipe, name="demos.hdf5"), r"is neither a regular file nor a folder"),
     "spec: a device": Row(endless, r"is no file of at most 256 kB"),
     "spec: large": Row(text("a: [" + "1, " * 500_000 + "]"), r"is no file of at most 256 kB"),

@@ -1,4 +1,4 @@
-"""Files that are in order as HDF5 and odd in what they hold: masks, labels, layouts of pictures, kinds of controls."""
+"""Files that are in order as HDF5 and odd in what they hold: masks, labels, layouts of pictures, controls."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -120,9 +120,8 @@ def _integers(steps: int, number: int, least: int, most: int, columns: int | Non
 
 def _bytes(*shape: int, dtype: str = "u1") -> Callable[[int, int], np.ndarray]:
     high = np.iinfo(dtype).max
-    return lambda steps, number: (
-        np.random.default_rng(number).integers(0, high, (steps, *shape)).astype(dtype)
-    )
+    random = np.random.default_rng
+    return lambda steps, number: random(number).integers(0, high, (steps, *shape)).astype(dtype)
 
 
 ROWS: dict[str, Row] = {

@@ -33,7 +33,7 @@ def pictures(number: int) -> np.ndarray:
 
 
 def maniskill(folder: Path, obs: str) -> Path:
-    """A file as ManiSkill's ``RecordEpisode`` writes it, with observations as one array, as a tree, or without."""
+    """A file as ManiSkill's ``RecordEpisode`` writes it, with observations as an array, a tree, or none."""
     path = folder / "trajectory.h5"
     with h5py.File(path, "w") as file:
         for number, steps in enumerate(LENGTHS):
@@ -83,7 +83,7 @@ def act_twice(folder: Path) -> Path:
 
 
 def robosuite(folder: Path, attribute: str) -> Path:
-    """What robosuite records, and what robomimic's ``convert_robosuite`` makes of it: states and controls alone."""
+    """What robosuite records, and what robomimic's ``convert_robosuite`` makes: states, controls alone."""
     path = folder / "demo.hdf5"
     with h5py.File(path, "w") as file:
         data = file.create_group("data")

@@ -104,9 +104,8 @@ def episode(index: int, key: str, value: object) -> Change:
         values = table[key].to_pylist()
         values[index] = value
         at = table.column_names.index(key)
-        return table.set_column(
-            at, table.schema.field(at), pyarrow.array(values, table.schema.field(at).type)
-        )
+        field = table.schema.field(at)
+        return table.set_column(at, field, pyarrow.array(values, field.type))
 
     return rewritten(EPISODES, change)
 
@@ -196,29 +195,19 @@ PATHS = {
 DROPPED = without_rows(7), episode(1, "length", 5)
 """A frame of episode 1 is gone, and everything that counts says so."""
 
+CUT = "demo_1: length in meta/episodes is 6, and .* has 5 rows"
+GAP = "has a gap before row 2:"
+RAGGED_ROW = "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct"
+LATE = r"demo_1: timestamp is 3\.2 in row 0, not 0; correct it, or fps"
+RENUMBERED = changed(*DROPPED, rewritten(DATA, renumbered))
 EPISODES_NOT_WHOLE = {
-    "lerobot dropped frame": (
-        changed(without_rows(7)),
-        "demo_1: length in meta/episodes is 6, and .* has 5 rows",
-    ),
-    "lerobot dropped frame, length corrected": (
-        changed(*DROPPED),
-        "demo_1: frame_index has a gap before row 2: 1,",
-    ),
-    "lerobot dropped frame, counted anew": (
-        changed(*DROPPED, rewritten(DATA, renumbered)),
-        r"demo_1: timestamp has a gap before row 2: 0\.1, then 0\.3",
-    ),
+    "lerobot dropped frame": (changed(without_rows(7)), CUT),
+    "lerobot dropped frame, length corrected": (changed(*DROPPED), f"demo_1: frame_index {GAP} 1,"),
+    "lerobot dropped frame, counted anew": (RENUMBERED, rf"demo_1: timestamp {GAP} 0\.1, then 0\.3"),
     "lerobot reversed": (changed(reversed_rows(5, 11)), "demo_1: frame_index steps back in row 1: 5, then 4"),
     "lerobot no rows": (changed(without_rows(*range(5, 11))), "demo_1: its rows are missing in"),
-    "lerobot ragged": (
-        changed(RAGGED),
-        "demo_0: action has 1 numbers in row 0, and meta/info.json says 2; correct",
-    ),
-    "lerobot late": (
-        in_episode_1("timestamp", lambda _, value: value + 3.2),
-        r"demo_1: timestamp is 3\.2 in row 0, not 0; correct it, or fps",
-    ),
+    "lerobot ragged": (changed(RAGGED), RAGGED_ROW),
+    "lerobot late": (in_episode_1("timestamp", lambda _, value: value + 3.2), LATE),
 }
 """Datasets of which one episode is not whole, and what is said of it."""
 
@@ -243,7 +232,8 @@ ROWS = {
     ),
     "lerobot without a control": Row(
         changed(renamed("action", "action.continuous")),
-        "there is no feature 'action'.*; there is: observation.state, action.continuous; .* --action action.continuous",
+        "there is no feature 'action'.*; there is: observation.state, action.continuous; .* --action "
+        "action.continuous",
     ),
     "lerobot without a place of videos": Row(changed(WITHOUT_VIDEOS), None),
 }
