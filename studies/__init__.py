@@ -1,1 +1,1 @@
-"""Studies: methods compared over training seeds and tasks. A package of the checkout (``python -m studies``)."""
+"""Methods compared over training seeds and tasks: a package of the checkout (``python -m studies``)."""

@@ -61,7 +61,7 @@ def study(action: str, paths: Sequence[Path], out: Path | None, jobs: int) -> st
 
 
 def told(folder: Folder, state: State) -> Iterator[str]:
-    """The cells of a study, a line each: what is missing or wrong, commits, chosen points, and those that are done."""
+    """The cells of a study, a line each: what is missing or wrong, commits, chosen points, and those done."""
     declared = folder.study.declared
     values = ", ".join(f"{measure} {value:g}" for measure, value in declared.failed.items()) or "nothing"
     for what, found in (
@@ -72,9 +72,8 @@ def told(folder: Folder, state: State) -> Iterator[str]:
     ):
         if found:
             yield f"{what}: {', '.join(f'{name} ({count})' for name, count in found.items())}"
-    chosen = dict.fromkeys(
-        declared.label(cell.of, cell.point, "") for cell in state.cells if cell.part == "test"
-    )
+    of_test = [cell for cell in state.cells if cell.part == "test"]
+    chosen = dict.fromkeys(declared.label(cell.of, cell.point, "") for cell in of_test)
     if declared.choose and chosen:
         yield f"the points with the highest {declared.choose} in development: {', '.join(chosen)}"
     yield f"{len(state.done)} of {len(state.cells)} cells are done"

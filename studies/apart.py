@@ -1,5 +1,4 @@
-"""A simulator that needs other packages than this project: an environment of its own, and the module that
-runs in it.
+"""A simulator with packages of its own: an environment for these, and the module that runs in it.
 
 A module has two commands: ``collect TASK OUT.hdf5`` records demonstrations (``arena_recording.py``), and
 ``play TASK OUT.json NAME=EXPORTED...`` lets exported controllers act (``arena_playing.py``).
@@ -70,24 +69,12 @@ class Apart:
         :raises Failed: it cannot be made.
         """
         folder, pins = self.runs / "venv", HERE / self.pins
-        python, marker, wanted = (
-            folder / "bin" / "python",
-            folder / INSTALLED,
-            pins.read_text(encoding="utf-8"),
-        )
+        python, marker = folder / "bin" / "python", folder / INSTALLED
+        wanted = pins.read_text(encoding="utf-8")
         with only_one(folder, wait=True):
             if not marker.exists() or marker.read_text(encoding="utf-8") != wanted:
-                pip = [
-                    str(python),
-                    "-m",
-                    "pip",
-                    "install",
-                    "-q",
-                    "--no-compile",
-                    "--no-deps",
-                    "-r",
-                    str(pins),
-                ]
+                quiet = ("-q", "--no-compile", "--no-deps")
+                pip = [str(python), "-m", "pip", "install", *quiet, "-r", str(pins)]
                 for command in ([sys.executable, "-m", "venv", "--clear", str(folder)], pip):
                     _run(command, f"{folder}: an environment with {pins.name} cannot be made")
                 write_text(marker, wanted)
@@ -112,9 +99,8 @@ class Apart:
         with tempfile.TemporaryDirectory() as folder:
             for name, one in methods.items():
                 (Path(folder) / name).mkdir()
-                write_numpy(one, Path(folder) / name) if isinstance(one, Fit) else one.write(
-                    Path(folder) / name
-                )
+                place = Path(folder) / name
+                write_numpy(one, place) if isinstance(one, Fit) else one.write(place)
             out, named = Path(folder) / "played.json", [f"{name}={folder}/{name}" for name in methods]
             self.run("play", task, out, *named, **options)
             return dict(json.loads(out.read_text()))
@@ -125,19 +111,10 @@ class Apart:
         :raises BadInput: it says that what it was given cannot be used; its last line.
         :raises Failed: it ended with another error; its last line.
         """
-        module = [
-            str(self.made()),
-            "-W",
-            "ignore",
-            "-P",
-            "-m",
-            f"studies.{Path(self.script).stem}",
-            what,
-            task,
-        ]
-        words = [
-            word for key, value in options.items() for word in (f"--{key.replace('_', '-')}", str(value))
-        ]
+        script = f"studies.{Path(self.script).stem}"
+        module = [str(self.made()), "-W", "ignore", "-P", "-m", script, what, task]
+        pairs = [(f"--{key.replace('_', '-')}", str(value)) for key, value in options.items()]
+        words = [word for pair in pairs for word in pair]
         _run([*module, *map(str, arguments), *words], f"{self.script} {what} {task}")
 
 
@@ -148,22 +125,23 @@ def _run(command: list[str], what: str) -> None:
     except OSError as error:
         raise Failed(f"{what}: {command[0]}: {error.strerror}") from error
     if ended.returncode:
-        said = (
-            ended.stderr.strip() or ended.stdout.strip() or f"exit status {ended.returncode}"
-        ).splitlines()
-        raise (BadInput if ended.returncode == BAD_INPUT else Failed)(f"{what}: {said[-1].strip()}")
+        said = ended.stderr.strip() or ended.stdout.strip() or f"exit status {ended.returncode}"
+        line = said.splitlines()[-1].strip()
+        raise (BadInput if ended.returncode == BAD_INPUT else Failed)(f"{what}: {line}")
+
+
+Episodes = Sequence[Mapping[str, float]]
+"""What each episode measures."""
 
 
 class Peers(ABC):
-    """A simulator whose methods are the policies of ``policies.py``; a cell may have other settings than their kind."""
+    """A simulator whose methods are the policies of ``policies.py``; a cell may have other settings."""
 
     def __init__(self) -> None:
         self.methods = {name: partial(self._policy, settings) for name, settings in KINDS.items()}
 
     @abstractmethod
-    def play(
-        self, task: str, fitted: Fit | Policy, starts: range, folder: Path
-    ) -> Sequence[Mapping[str, float]]:
+    def play(self, task: str, fitted: Fit | Policy, starts: range, folder: Path) -> Episodes:
         """Episodes of a policy: success, and what else the simulator measures."""
 
     def _policy(self, settings: Settings, job: Job) -> dict[str, float]:
@@ -186,7 +164,7 @@ class Chunked:
 
 
 class World(Peers):
-    """A simulator apart as the world of a study; of its method ``chunked``, options emit chunks of controls."""
+    """A simulator apart as the world of a study; of its method ``chunked``, options emit chunks."""
 
     def __init__(self, simulator: Apart) -> None:
         super().__init__()
@@ -197,14 +175,11 @@ class World(Peers):
         """Settings are ``chunk``, ``executed``, and key paths of the spec."""
         spec = {key: value for key, value in job.settings.items() if "." in key}
         chunk, executed = job.settings["chunk"], job.settings["executed"]
-        fitted = fit_spec(
-            with_overrides(job.spec, spec), chunked(job.demos, chunk), out=job.folder / "fit", keep=False
-        )
+        own, demos = with_overrides(job.spec, spec), chunked(job.demos, chunk)
+        fitted = fit_spec(own, demos, out=job.folder / "fit", keep=False)
         return means(self.play(job.cell.task, Chunked(fitted, chunk, executed), job.starts, job.folder))
 
-    def play(
-        self, task: str, fitted: Fit | Written, starts: range, folder: Path
-    ) -> Sequence[Mapping[str, float]]:
+    def play(self, task: str, fitted: Fit | Written, starts: range, folder: Path) -> Episodes:
         """Episodes of the exported policy: success, steps, and what else the simulator measures."""
         played = self.simulator.played(task, {"policy": fitted}, first=starts.start, episodes=len(starts))
         return [{name: float(value) for name, value in one.items()} for one in played["episodes"]["policy"]]

@@ -5,8 +5,7 @@
 
 ``collect`` records the scripted expert, executed with normal noise on every control; of each step its phase
 is the return statement by which the expert's ``_desired_pos`` ended, or the assignment of ``delta_pos`` where
-it has none. ``play`` lets exported controllers act from initial states that were never demonstrated, the same
-for all.
+it has none. ``play`` lets exported controllers act from the same initial states, never demonstrated.
 """
 
 from __future__ import annotations
@@ -136,10 +135,8 @@ def main() -> None:
     own = parser.parse_args()
     warnings.filterwarnings("ignore")  # the experts' gains are meant to saturate
     if own.task not in ENV_POLICY_MAP:
-        print(
-            f"there is no task {own.task!r}; Meta-World has: {', '.join(sorted(ENV_POLICY_MAP))}",
-            file=sys.stderr,
-        )
+        known = ", ".join(sorted(ENV_POLICY_MAP))
+        print(f"there is no task {own.task!r}; Meta-World has: {known}", file=sys.stderr)
         raise SystemExit(2)
     if own.what == "collect":
         collect(own.task, own.out, own.number, own.held_out, own.noise, own.first or 0, own.attempts)

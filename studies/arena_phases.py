@@ -1,4 +1,4 @@
-"""Which statement of a function decided what it returns: the phase that a scripted policy was in. Needs no package."""
+"""Which statement of a function decided what it returns: a scripted policy's phase. Needs no package."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from typing import Any
 
 
 class Phases:
-    """The return statements of a function, 0 to P − 1 in the order of their lines, and which of them a call
-    reached.
+    """The return statements of a function, 0 to P − 1 in the order of lines, and which of them calls reached.
 
     The function is not changed: while it runs it is traced, and what returns is told by its line.
 
@@ -23,15 +22,13 @@ class Phases:
     """
 
     def __init__(self, function: Callable[..., Any], key: str | None = None) -> None:
-        self._event, kind = (
-            ("return", "return statement") if key is None else ("line", f"assignment to {key!r}")
-        )
+        of_key = ("line", f"assignment to {key!r}")
+        self._event, kind = ("return", "return statement") if key is None else of_key
         self._code: CodeType = inspect.unwrap(function).__code__
         lines, first = inspect.getsourcelines(self._code)
         tree = ast.parse(textwrap.dedent("".join(lines)))
-        returns = sorted(
-            (node.lineno, node.end_lineno or node.lineno) for node in _decisive(tree.body[0], key)
-        )
+        found = _decisive(tree.body[0], key)
+        returns = sorted((node.lineno, node.end_lineno or node.lineno) for node in found)
         if not returns:
             raise ValueError(f"{function.__qualname__} has no {kind}")
         self.lines = [first + start - 1 for start, _ in returns]
@@ -43,8 +40,7 @@ class Phases:
         self._last: int | None = None
 
     def of(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int]:
-        """What ``call(*arguments)`` returns, and the phase in which the function, called by it last,
-        returned.
+        """What ``call(*arguments)`` returns, and the phase in which the function, called last, returned.
 
         :raises LookupError: the function was not called.
         """
@@ -68,14 +64,11 @@ class Phases:
 
 
 def _decisive(node: ast.AST, key: str | None) -> list[ast.stmt]:
-    """The return statements of a function, or its assignments to a key, without those of functions inside it."""
+    """The return statements of a function, or its assignments to a key, without those of inner functions."""
     inner = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)
     children = [child for child in ast.iter_child_nodes(node) if not isinstance(child, inner)]
     own = [child for child in children if isinstance(child, ast.Return if key is None else ast.Assign)]
     if key is not None:
-        own = [
-            one
-            for one in own
-            if isinstance(one, ast.Assign) and ast.unparse(one.targets[0]).endswith(f"[{key!r}]")
-        ]
+        assigned = [one for one in own if isinstance(one, ast.Assign)]
+        own = [one for one in assigned if ast.unparse(one.targets[0]).endswith(f"[{key!r}]")]
     return [*own, *(found for child in children for found in _decisive(child, key))]

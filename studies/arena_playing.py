@@ -56,8 +56,7 @@ def named_controllers(named: Iterable[str]) -> dict[str, Any]:
 def exported(folder: str | Path) -> Any:
     """The ``Runner`` of an exported controller, by the ``runner.py`` that was exported beside it.
 
-    With a ``chunk.json`` beside it (:func:`write_chunk`), the controller gives chunks of actions
-    (:class:`Chunks`).
+    With a ``chunk.json`` beside it (:func:`write_chunk`), it gives chunks of actions (:class:`Chunks`).
     """
     path = Path(folder) / "runner.py"
     spec = importlib.util.spec_from_file_location("exported_runner", path)
@@ -66,11 +65,8 @@ def exported(folder: str | Path) -> Any:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     beside = path.with_name("chunk.json")
-    return (
-        Chunks(module.Runner(folder), **json.loads(beside.read_text()))
-        if beside.exists()
-        else module.Runner(folder)
-    )
+    runner = module.Runner(folder)
+    return Chunks(runner, **json.loads(beside.read_text())) if beside.exists() else runner
 
 
 def write_chunk(folder: Path, chunk: int, executed: int) -> None:

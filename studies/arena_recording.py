@@ -39,9 +39,8 @@ def collect(
         while len(names) < number:
             if seed >= first + attempts:
                 temporary.unlink()
-                raise SystemExit(
-                    f"{environment}: the expert succeeded in {len(names)} of {attempts} episodes; {number} are needed"
-                )
+                succeeded = f"the expert succeeded in {len(names)} of {attempts} episodes"
+                raise SystemExit(f"{environment}: {succeeded}; {number} are needed")
             recorded = demonstrate(seed)
             if recorded is not None:
                 names.append(f"demo_{len(names)}")

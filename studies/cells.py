@@ -1,7 +1,6 @@
 """Cells of a study: one fit each, with its rollouts, kept as soon as it is done.
 
-The folder of a study holds results (``cells/KEY.json``), fits (``work/KEY``) and ``demonstrations``. It may
-be moved.
+A study's folder may be moved. It holds results (``cells/KEY.json``), fits (``work/KEY``), ``demonstrations``.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ FAILED, RISING, DIRTY = "failed", "not converged", "-dirty"
 
 
 class Done(Record):
-    """The results of a cell by measure, or why it failed; all that decides them, and the commit that gave them."""
+    """The results of a cell by measure, or why it failed; all that decides them, and the commit of them."""
 
     depends: dict[str, Any] = Field(default={})
     values: dict[str, Any] = Field(default={})
@@ -70,20 +69,16 @@ def kept(path: Path, depends: Mapping[str, Any] | None) -> Done | None:
 def do(
     path: Path, depends: Mapping[str, Any], work: Callable[[Path], Mapping[str, Any]], code: str = ""
 ) -> str:
-    """Do a cell on one thread, unless another process does, and keep its results in ``path``; returns why it failed."""
+    """Do a cell on one thread unless another process does, keep its results in ``path``; why it failed."""
     folder = path.parents[1] / "work" / path.stem
     try:
         with only_one(folder):
-            if (
-                before := kept(path, depends)
-            ) is not None and not before.failed:  # another process has done it
+            before = kept(path, depends)
+            if before is not None and not before.failed:  # another process has done it
                 return ""
             begun = folder / "code"
-            if (
-                (path.exists() and before is None)
-                or not begun.exists()
-                or begun.read_text(encoding="utf-8") != code
-            ):
+            same = begun.exists() and begun.read_text(encoding="utf-8") == code
+            if (path.exists() and before is None) or not same:
                 shutil.rmtree(folder / "fit", ignore_errors=True)  # of other defaults or of another commit
             write_text(begun, code)
             try:
@@ -109,7 +104,7 @@ def do_all(
 
 
 def commit_of(path: Path) -> str:
-    """The last commit that changed library, tasks, ``studies`` or the declaration; ``-dirty`` if changed since."""
+    """The last commit that changed library, tasks, studies or declaration; ``-dirty`` if changed since."""
     path = path.resolve()
     paths = ["ddco_pyro", "tasks", ":(glob)studies/*.py", *([str(path)] if path.is_relative_to(ROOT) else [])]
 
@@ -125,7 +120,7 @@ def commit_of(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """A fit in the test or the development: ``method`` is its name in tables, ``of`` that in the declaration."""
+    """A fit in the test or the development: ``method`` is its name in tables, ``of`` in the declaration."""
 
     part: str
     task: str
@@ -146,7 +141,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Job:
-    """The work of a cell, for a world's own methods: demonstrations have the masks ``train`` and ``valid``."""
+    """The work of a cell, for a world's own methods: demonstrations with masks ``train`` and ``valid``."""
 
     cell: Cell
     spec: Spec
@@ -182,7 +177,7 @@ class Folder:
     path: Path
 
     def cells(self, part: str, chosen: Mapping[str, dict[str, Any]] | None = None) -> list[Cell]:
-        """The cells of a part, with all points of the grid or the chosen ones; a training seed before another."""
+        """The cells of a part, with all points of the grid or the chosen ones; by training seed first."""
         declared, block = self.study.declared, getattr(self.study.declared.seeds, part)
         return [
             Cell(
@@ -207,12 +202,10 @@ class Folder:
         known = {cell: one for cell in cells if (one := self.kept(cell))}
         codes = dict.fromkeys(one.code for one in known.values())
         if self.study.declared.pinned and len(codes) > 1:
-            raise BadInput(
-                f"{self.study.path}: pinned: results are of commits {', '.join(codes)}; keep those of one"
-            )
-        done, failed = (
-            {cell: one for cell, one in known.items() if bool(one.failed) is way} for way in (False, True)
-        )
+            why = f"results are of commits {', '.join(codes)}; keep those of one"
+            raise BadInput(f"{self.study.path}: pinned: {why}")
+        done = {cell: one for cell, one in known.items() if not one.failed}
+        failed = {cell: one for cell, one in known.items() if one.failed}
         if values := self.study.declared.failed:
             failed = {cell: one.model_copy(update={"values": values}) for cell, one in failed.items()}
         return State(cells, done, failed)
@@ -227,9 +220,8 @@ class Folder:
         def mean(name: str, point: dict[str, Any]) -> float:
             return float(np.mean(scores[declared.label(name, point, "development")]))
 
-        return {
-            name: max(method.points, key=partial(mean, name)) for name, method in declared.methods.items()
-        }
+        methods = declared.methods.items()
+        return {name: max(method.points, key=partial(mean, name)) for name, method in methods}
 
     def kept(self, cell: Cell) -> Done | None:
         """The results of a cell, if it is done: here, or in the declaration's tables ``kept``."""
@@ -242,8 +234,9 @@ class Folder:
         if known is None or known.failed:  # such a cell is tried again
             known = kept(self.place(cell), None if pinned else self.depends(cell)) or known
         if known and pinned and known.key != (here := self.key(cell)):
-            text = f"was done with key {known.key or 'unknown'}, here is {here}; go back to what was declared then, or"
-            raise BadInput(f"{self.study.path}: pinned: {cell}: {text} remove its results")
+            text = f"was done with key {known.key or 'unknown'}, here is {here}"
+            remedy = "go back to what was declared then, or remove its results"
+            raise BadInput(f"{self.study.path}: pinned: {cell}: {text}; {remedy}")
         return known
 
     @cached_property
@@ -270,7 +263,7 @@ class Folder:
         return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:16]
 
     def depends(self, cell: Cell) -> dict[str, Any]:
-        """What the results of a cell depend on; ``added`` is what the code adds: defaults, or the template of init."""
+        """What the results of a cell depend on; ``added`` is the code's: defaults, or init's template."""
         study, method, starts = self.study, self.study.declared.methods[cell.of], self._seeds("starts", cell)
         baseline, given, added = method.baseline, study.changes(cell.of, cell.point), dict[str, Any]()
         if study.base is None:
@@ -280,16 +273,16 @@ class Folder:
             spec = with_overrides(study.base, {**given, **_placed(cell, "demonstrations.hdf5")})
             baseline = baseline and named_baselines(spec).get(baseline.kind, baseline)
             shown = {"report", "selection", "compare_with"}  # what a result does not depend on
-            given, added = (
-                spec.model_dump(mode="json", exclude=shown, exclude_defaults=own) for own in (True, False)
-            )
+            dumped = partial(spec.model_dump, mode="json", exclude=shown)
+            given, added = (dumped(exclude_defaults=own) for own in (True, False))
         return {
             "baseline": baseline and baseline.model_dump(exclude_unset=True, mode="json"),
             "by": method.by,
             "settings": study.settings(cell.of, cell.point),
             "world": study.declared.world,
             # keys of earlier results have a supervisor
-            "data": {"task": cell.task, "supervisor": None, "first": self._seeds("demonstrations", cell).start,
+            "data": {"task": cell.task, "supervisor": None,
+                     "first": self._seeds("demonstrations", cell).start,
                      "train": cell.demonstrations, "held_out": study.declared.demonstrations.held_out},
             "seed": cell.seed,
             "starts": [*starts[:1], len(starts)],
@@ -327,9 +320,8 @@ class Folder:
         if pinned and code.endswith(DIRTY):
             text = f"the code has changes since {code.removesuffix(DIRTY)}; commit them"
         elif pinned and others and len(state.done) < len(state.cells):
-            text = (
-                f"results are of commit {others.pop()}, here is {code}; run it at that commit, or remove them"
-            )
+            remedy = "run it at that commit, or remove them"
+            text = f"results are of commit {others.pop()}, here is {code}; {remedy}"
         else:
             return
         raise BadInput(f"{self.study.path}: pinned: {text}")
@@ -365,16 +357,15 @@ class Folder:
         return path
 
     def _prepared(self, cell: Cell, file: Path) -> tuple[Spec, Demonstrations]:
-        """The spec of a cell and its demonstrations: the first ones of the file are held out, those after train."""
+        """The spec of a cell and its demonstrations: the file's first ones are held out, the next train."""
         study, held_out = self.study, self.study.declared.demonstrations.held_out
         with open_source(file) as source:
             names = sorted(source.names, key=natural)
         valid, rest = names[:held_out], names[held_out:]
         train, unused = rest[: cell.demonstrations], rest[cell.demonstrations :]
         if (base := study.base) is None:
-            facts = replace(
-                inspect(file, exclude=[*valid, *unused]), excluded=(), masks={}
-            )  # no others are shown
+            found = inspect(file, exclude=[*valid, *unused])
+            facts = replace(found, excluded=(), masks={})  # no others are shown
             base = parse_spec(read_yaml(starting_spec(facts, file).text))
         placed = _placed(cell, file.relative_to(self.path).as_posix())
         spec = with_overrides(base, {**study.changes(cell.of, cell.point), **placed})
@@ -393,7 +384,5 @@ class Folder:
 def _placed(cell: Cell, path: str) -> dict[str, Any]:
     """What a spec says of a cell's data, by key path. The path is relative: the study's folder may move."""
     own = {"path": path, "exclude": [], "count": max(2, cell.demonstrations), "seed": 0}
-    return {f"demonstrations.{key}": value for key, value in own.items()} | {
-        "training.seed": None,
-        "seed": cell.seed,
-    }
+    of_demonstrations = {f"demonstrations.{key}": value for key, value in own.items()}
+    return of_demonstrations | {"training.seed": None, "seed": cell.seed}

@@ -20,13 +20,11 @@ from ddco_pyro.spec.base import Count, Items, Model, Problems, Seed, Text, lines
 from ddco_pyro.spec.model import Baseline
 from ddco_pyro.spec.yaml import read_mapping
 
+LINEAR = {"network": "linear"}
 SKELETON = {
     "demonstrations": {"path": "none.hdf5"},
     "observations": ["none"],
-    "hierarchy": {
-        "levels": [{"count": 2, "policy": {"network": "linear"}}],
-        "meta_policy": {"network": "linear"},
-    },
+    "hierarchy": {"levels": [{"count": 2, "policy": LINEAR}], "meta_policy": LINEAR},
 }
 """A spec like those of ``init``, in which overrides are checked before there are demonstrations."""
 
@@ -166,7 +164,8 @@ class Declaration(Model):
     def _named(self) -> Iterator[tuple[bool, str, str]]:
         known, counts = (NATS, *UNMATCHED, *MATCHED), self.demonstrations.counts
         for number, one in enumerate(self.measures):
-            text = f"there is no measure {one!r}{nearest(one, known)}; without starts there is: {', '.join(known)}"
+            there = ", ".join(known)
+            text = f"there is no measure {one!r}{nearest(one, known)}; without starts there is: {there}"
             yield self.starts is None and one not in known, f"measures.{number}", text
         for number, contrast in enumerate(self.contrasts):
             at, count = f"contrasts.{number}", contrast.demonstrations
@@ -183,14 +182,10 @@ class Declaration(Model):
             both = method.by is not None and method.baseline is not None
             yield both, f"methods.{name}.baseline", "stands beside by; keep one of the two"
             for path in method.overrides.keys() & method.grid.keys():
-                yield (
-                    True,
-                    f"methods.{name}.overrides",
-                    f"has {path!r}, which the grid has, too; keep one of the two",
-                )
-        yield from (
-            (name not in self.measures, f"failed.{name}", f"{name!r} {AMONG}") for name in self.failed
-        )
+                text = f"has {path!r}, which the grid has, too; keep one of the two"
+                yield True, f"methods.{name}.overrides", text
+        for name in self.failed:
+            yield name not in self.measures, f"failed.{name}", f"{name!r} {AMONG}"
 
     def _chosen(self) -> Iterator[tuple[bool, str, str]]:
         choose, none = self.choose, self.choose is None
@@ -200,22 +195,15 @@ class Declaration(Model):
         for number, task in enumerate(self.choose_on):
             text = f"{task!r} is not among tasks, or there is nothing to choose; remove it"
             yield none or task not in self.tasks, f"choose_on.{number}", text
-        trials = {
-            name: len({point_name(point) for point in one.points}) for name, one in self.methods.items()
-        }
-        yield (
-            none and {*trials.values()} != {1},
-            "choose",
-            "missing; name the measure that chooses among the points",
-        )
+        points = {name: {point_name(point) for point in one.points} for name, one in self.methods.items()}
+        trials = {name: len(own) for name, own in points.items()}
+        text = "missing; name the measure that chooses among the points"
+        yield none and {*trials.values()} != {1}, "choose", text
         counts = ", ".join(f"{name} {count}" for name, count in trials.items())
         text = f"have unequal numbers of points to choose from ({counts}); name as many for each"
         yield not none and len({*trials.values()}) > 1, "methods", text
-        yield (
-            not none and {*trials.values()} == {1},
-            "methods",
-            "have nothing to choose from; give each a grid",
-        )
+        text = "have nothing to choose from; give each a grid"
+        yield not none and {*trials.values()} == {1}, "methods", text
 
     def label(self, method: str, point: dict[str, Any], part: str = "test") -> str:
         """The name of a method in tables: in the development with the point of the grid."""
@@ -232,20 +220,16 @@ class Study:
 
     @classmethod
     def load(cls, path: Path) -> Study:
-        """Read a declaration and check the spec of every method; raises SpecError, one line for each problem."""
+        """Read a declaration and check the spec of every method; raises SpecError, a line per problem."""
         try:
             declared = Declaration.model_validate(read_mapping(path, "study"))
         except ValidationError as error:
             raise SpecError(*(f"{path}: {line}" for line in lines(error, Declaration))) from None
-        study = cls(
-            path,
-            declared,
-            None if declared.spec == "init" else load_spec(path.parent / declared.spec, (), True),
-        )
+        base = None if declared.spec == "init" else load_spec(path.parent / declared.spec, (), True)
+        study = cls(path, declared, base)
         given: Any = SKELETON if study.base is None else study.base.model_dump(exclude_unset=True)
-        for name, point in [
-            (name, point) for name, method in declared.methods.items() for point in method.points
-        ]:
+        methods = declared.methods.items()
+        for name, point in [(name, point) for name, method in methods for point in method.points]:
             try:
                 parse_spec(given, study.changes(name, point))
             except SpecError as error:

@@ -63,20 +63,18 @@ class NewTasks(MetaWorld):
         train = job.demos.select(job.demos.masks["train"])
         trainer = Trainer(spec, dimensions_for(spec, job.demos), train, train, library=prior_of(spec))
         model, restart = trainer.data.hierarchy(0), Restart(Progress(0))
-        training = StageTraining(
-            trainer.data, model, Stage("gates", None, None, CHOOSING), restart, last=True
-        )
+        stage = Stage("gates", None, None, CHOOSING)
+        training = StageTraining(trainer.data, model, stage, restart, last=True)
         while not training.converged:
             training.epoch(None)
         training.end(None)
         return means(self.play(job.cell.task, Fit(spec, model), job.starts, job.folder))
 
     def _pooled(self, job: Job) -> dict[str, float]:
-        """Agreement in the cell's task of a fit of its demonstrations and those of the library's other tasks."""
+        """Agreement in the cell's task of a fit of its demonstrations and of the library's other tasks."""
         others = [demo for task, each in recorded().items() if task != job.cell.task for demo in each]
-        (file,) = (job.folder.parents[1] / "demonstrations").glob(
-            f"{job.cell.task}-*.hdf5"
-        )  # with all it has
+        folder = job.folder.parents[1] / "demonstrations"
+        (file,) = folder.glob(f"{job.cell.task}-*.hdf5")  # with all it has
         own = [_named(demo, job.cell.task) for demo in Demonstrations.read(file).select(job.demos.names)]
         held_out = tuple(f"{job.cell.task}_{name}" for name in job.demos.masks["valid"])
         path = job.folder / "pooled.hdf5"

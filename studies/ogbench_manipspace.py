@@ -1,8 +1,8 @@
 """What is done with OGBench's manipulation tasks, by the Python of an environment of its own (``apart.py``).
 
     python -m studies.ogbench_manipspace collect TASK OUT.hdf5 [--number 60] [--noise 0.0] [--goal 0]
-    [--labels phase] python -m studies.ogbench_manipspace play TASK OUT.json NAME=EXPORTED... [--episodes 50]
-    [--first 0]
+        [--labels phase]
+    python -m studies.ogbench_manipspace play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--first 0]
 
 ``collect`` records OGBench's scripted Markov oracles as OGBench's "noisy" data sets were: an episode has
 several targets one after another, drawn by the environment, and normal noise on every control, whose level is

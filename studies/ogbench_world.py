@@ -1,5 +1,4 @@
-"""OGBench's manipulation tasks as worlds of a study: the goal is observed (``SHOWN``), or it is not
-(``HIDDEN``).
+"""OGBench's manipulation tasks as worlds of a study: the goal is observed (``SHOWN``), or not (``HIDDEN``).
 
 The environment is made in ``runs/ogbench/venv`` from ``ogbench_requirements.txt``, and
 ``ogbench_manipspace.py`` runs in it.

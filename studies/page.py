@@ -1,7 +1,6 @@
 """Generated tables of pages, as ``docs/studies.md`` describes them, and the report of a study.
 
-Between ``<!-- table: PAGE/NAME -->`` and ``<!-- end -->`` stands the table ``## NAME`` of
-``studies/tables/PAGE.md``.
+``studies/tables/PAGE.md`` has a table ``## NAME`` for ``<!-- table: PAGE/NAME -->`` to ``<!-- end -->``.
 """
 
 from __future__ import annotations
@@ -64,11 +63,9 @@ SHOWN: dict[str, Callable[[Estimate, str], str]] = {
 
 
 def render(text: str) -> str:
-    """A page's text with its generated tables as the results have them; raises BadInput if one is not there."""
-    numbers, templates = (
-        Numbers(),
-        {match.groups(): template(*match.groups()) for match in BLOCK.finditer(text)},
-    )
+    """A page's text with its generated tables as the results have them; raises BadInput if one is missing."""
+    numbers = Numbers()
+    templates = {match.groups(): template(*match.groups()) for match in BLOCK.finditer(text)}
     for one in templates.values():
         NUMBER.sub(numbers.shown, one)  # finds the families of differences
     numbers.judge()
@@ -83,9 +80,8 @@ def render(text: str) -> str:
 def template(place: str, name: str) -> str:
     """A table before its numbers are there; raises BadInput if there is none."""
     path = STUDIES / "tables" / f"{place}.md"
-    parts = re.split(
-        r"^## (\w+)\n", path.read_text(encoding="utf-8") if path.exists() else "", flags=re.MULTILINE
-    )
+    kept = path.read_text(encoding="utf-8") if path.exists() else ""
+    parts = re.split(r"^## (\w+)\n", kept, flags=re.MULTILINE)
     known = dict(zip(parts[1::2], parts[2::2], strict=True))
     if name not in known:
         raise BadInput(f"{path}: has no table {name!r}{nearest(name, known)}; add it under: ## {name}")
@@ -94,7 +90,7 @@ def template(place: str, name: str) -> str:
 
 @dataclass
 class Numbers:
-    """The numbers of a page, families of differences in ``.csv`` files, and verdicts on these and primary contrasts."""
+    """The numbers of a page, families of differences in ``.csv`` files, and verdicts on primary contrasts."""
 
     tables: dict[str, tuple[Study | None, pd.DataFrame]] = field(default_factory=dict)
     estimates: dict[Any, Estimate | None] = field(default_factory=dict)
@@ -108,7 +104,7 @@ class Numbers:
             self.verdicts |= {key: verdict for key, (verdict, _) in zip(family, judged, strict=True)}
 
     def table(self, source: str) -> tuple[Study | None, pd.DataFrame]:
-        """The study ``STUDY.yaml`` with its rows by the names of the declaration; the rows of ``TABLE.csv``."""
+        """The study ``STUDY.yaml`` with its rows by its declaration's names; the rows of ``TABLE.csv``."""
         if source not in self.tables:
             study = Study.load(STUDIES / source) if source.endswith(".yaml") else None
             table = statistics.earlier(study) if study else statistics.read_tidy(RESULTS / source)
@@ -130,8 +126,9 @@ class Numbers:
         plain = [part.split(" | ") for part in fields if not SETTING.fullmatch(part)]
         shows = (*SHOWN, "verdict", EQUIVALENCE)
         if len(plain) not in (2, 3) or settings.get("show", "mean") not in shows:
-            text = "write a method or contrast, a measure and a number of demonstrations, such as: options - flat; "
-            raise BadInput(f"{match[0]}: {text}success; 50. After show= stands one of: {', '.join(shows)}")
+            text = "write a method or contrast, a measure and a number of demonstrations, such as: options - "
+            text += f"flat; success; 50. After show= stands one of: {', '.join(shows)}"
+            raise BadInput(f"{match[0]}: {text}")
         whats, measures, counts = [*plain, [""]][:3]
         alone, by_task, rows = max(map(len, (whats, measures, counts))) == 1, settings.get("by") == "task", []
         tasks: list[Any] = sorted({*self.table(source)[1].task}) if by_task else [settings.get("task")]
@@ -139,9 +136,8 @@ class Numbers:
             numbers = tuple(count.split(" - "))
             cells = [self._number((source, what, measure, numbers, task), settings, alone) for what in whats]
             if any(cells):
-                rows.append(
-                    [str(task), " − ".join(numbers), name_of(measure), *(text or "–" for text in cells)]
-                )
+                filled = [text or "–" for text in cells]
+                rows.append([str(task), " − ".join(numbers), name_of(measure), *filled])
         if not rows:
             raise BadInput(f"{match[0]}: there is no such number; check its names")
         head = ["task", "demonstrations", "measure", *(what.replace(" - ", " − ") for what in whats)]
@@ -188,34 +184,17 @@ def report(folder: Folder, state: State) -> str:
     write_text(folder.path / "table.csv", table.to_csv(index=False, lineterminator="\n", float_format="%.9g"))
     rows, means = list[list[str]](), list[list[str]]()
     for one in tested(study, table):
-        numbers = (
-            [SHOWN[show](one.estimate, "+.2f") for show in ("interval", "median")]
-            if one.estimate
-            else ["–"] * 2
-        )
-        facts = [
-            one.spec.contrast,
-            name_of(one.spec.measure),
-            str(one.demonstrations),
-            one.spec.kind,
-            one.verdict,
-        ]
+        known = one.estimate
+        numbers = [SHOWN[show](known, "+.2f") for show in ("interval", "median")] if known else ["–"] * 2
+        facts = [one.spec.contrast, name_of(one.spec.measure), str(one.demonstrations)]
+        facts += [one.spec.kind, one.verdict]
         rows.append([*facts, *numbers, "–" if one.verdict == NOT_TESTED else words.p_value(one.adjusted)])
-    head = [
-        "contrast",
-        "measure",
-        "demonstrations",
-        "kind",
-        "verdict",
-        "mean [95 % t]",
-        "median [95 %]",
-        "adjusted p",
-    ]
+    head = ["contrast", "measure", "demonstrations", "kind", "verdict"]
+    head += ["mean [95 % t]", "median [95 %]", "adjusted p"]
     tables = [Table(head, rows, {0, 1, 3, 4}).markdown()] if rows else []
     for count, method in product(declared.demonstrations.counts, declared.methods):
         own = [estimated(study, table, method, measure, [count]) for measure in declared.measures]
         means.append([str(count), method, *(shown(known) if known else "–" for known in own)])
-    tables.append(
-        Table(["demonstrations", "method", *map(name_of, declared.measures)], means, {1}).markdown()
-    )
+    columns = ["demonstrations", "method", *map(name_of, declared.measures)]
+    tables.append(Table(columns, means, {1}).markdown())
     return "\n\n".join([f"# Study {study.path.stem}", declared.question, *tables])

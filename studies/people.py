@@ -1,5 +1,4 @@
-"""Gestures of surgeons: options without labels, and with a few, beside what a user would try instead
-(JIGSAWS).
+"""Gestures of surgeons (JIGSAWS): options without and with a few labels, beside what else a user would try.
 
     python -m studies.people --data FOLDER [--tasks Knot_Tying Suturing] [--splits last surgeon trial]
         [--labelled 0 1 3 5 all] [--jobs 2]
@@ -72,32 +71,25 @@ class PeopleCell(Cell):
         path = Path(self.data) / f"{self.task}.hdf5"
         demos = divided(labelled_demonstrations(path), self.fold)
         train, valid = (demos.select(demos.masks[part]) for part in ("train", "valid"))
-        facts = inspect(
-            path, exclude=[name for name in Demonstrations.read(path).names if name not in train.names]
-        )
+        others = [name for name in Demonstrations.read(path).names if name not in train.names]
+        facts = inspect(path, exclude=others)
         plain = parse_spec(read_yaml(starting_spec(replace(facts, excluded=(), masks={}), path).text))
         small = decide(plain, replace(train, masks={}), demos.frequency)
         text = starting_spec(replace(facts, excluded=(), masks={}), path, decided=small).text
         spec = with_overrides(parse_spec(read_yaml(text)), ALONE | {"seed": settings.values["seed"]})
-        truth, count = (
-            [demo.labels[LABELS] for demo in valid],
-            spec.hierarchy.levels[0].count if spec.hierarchy else 1,
-        )
+        truth = [demo.labels[LABELS] for demo in valid]
+        count = spec.hierarchy.levels[0].count if spec.hierarchy else 1
         if self.labelled == "0":
             found, typical = fit(spec, demos), typical_length(demo.labels[LABELS] for demo in train)
-            kinds = {
-                "options": list(found.segment(valid)[0]),
-                "windowed k-means": clusters(found, train, valid, count),
-            }
-            kinds |= dict(
-                zip(("AR-HMM", "AR-HMM, sticky"), autoregressive(train, valid, count, typical), strict=True)
-            )
+            kinds = {"options": list(found.segment(valid)[0])}
+            kinds["windowed k-means"] = clusters(found, train, valid, count)
+            states = autoregressive(train, valid, count, typical)
+            kinds |= dict(zip(("AR-HMM", "AR-HMM, sticky"), states, strict=True))
             kinds["options, β = 1"] = list(fit(with_overrides(spec, USUAL), demos).segment(valid)[0])
             asked = decide(plain, replace(train, masks={}), demos.frequency, typical)
             as_asked = starting_spec(replace(facts, excluded=(), masks={}), path, decided=asked).text
-            longer = with_overrides(
-                parse_spec(read_yaml(as_asked)), ALONE | {"seed": settings.values["seed"]}
-            )
+            alone = ALONE | {"seed": settings.values["seed"]}
+            longer = with_overrides(parse_spec(read_yaml(as_asked)), alone)
             kinds["options, --segment"] = list(fit(longer, demos).segment(valid)[0])
             kinds["equal lengths"] = [equal_lengths(len(demo), count) for demo in valid]
             named = {name: matched(own, truth) for name, own in kinds.items()}
@@ -147,9 +139,8 @@ USUAL: dict[str, Any] = {
 def labelled_demonstrations(path: Path) -> Demonstrations:
     """The demonstrations that have gestures."""
     if not path.is_file():
-        raise BadInput(
-            f"{path}: is missing; make it with: ddco-pyro import JIGSAWS/{path.stem} --out {path} --hz 10"
-        )
+        remedy = f"make it with: ddco-pyro import JIGSAWS/{path.stem} --out {path} --hz 10"
+        raise BadInput(f"{path}: is missing; {remedy}")
     demos = Demonstrations.read(path, labels=[LABELS])
     names = [demo.name for demo in demos if (demo.labels[LABELS] >= 0).any()]
     return demos.select(names)
@@ -168,9 +159,8 @@ def divided(demos: Demonstrations, fold: str) -> Demonstrations:
     if split == "last":
         of: dict[str, list[tuple[int, str]]] = {}
         for demo in demos:
-            of.setdefault(str(demo.attributes["surgeon"]), []).append(
-                (int(demo.attributes["trial"]), demo.name)
-            )
+            trial = (int(demo.attributes["trial"]), demo.name)
+            of.setdefault(str(demo.attributes["surgeon"]), []).append(trial)
         valid = {max(trials)[1] for trials in of.values()}
     else:
         valid = {demo.name for demo in demos if str(demo.attributes[split]) == value}
@@ -181,15 +171,10 @@ def divided(demos: Demonstrations, fold: str) -> Demonstrations:
 def with_labels(demos: Demonstrations, train: Demonstrations, number: int) -> Demonstrations:
     """The labels of so many training demonstrations, spread over them in order; -1 in others."""
     chosen = {train.names[place] for place in np.linspace(0, len(train) - 1, number).round().astype(int)}
-    return replace(
-        demos,
-        demonstrations=tuple(
-            replace(
-                demo, labels={**demo.labels, KNOWN: np.where(demo.name in chosen, demo.labels[LABELS], -1)}
-            )
-            for demo in demos
-        ),
-    )
+    labels = [np.where(demo.name in chosen, demo.labels[LABELS], -1) for demo in demos]
+    pairs = zip(demos, labels, strict=True)
+    known = tuple(replace(demo, labels={**demo.labels, KNOWN: own}) for demo, own in pairs)
+    return replace(demos, demonstrations=known)
 
 
 def typical_length(labels: Iterable[np.ndarray]) -> float:
@@ -216,11 +201,9 @@ def clusters(found: Fit, train: Demonstrations, valid: Demonstrations, count: in
 def autoregressive(
     train: Demonstrations, valid: Demonstrations, count: int, typical: float
 ) -> Iterator[list[np.ndarray]]:
-    """States of dynamax' AR-HMM, without stickiness, and with the one whose median segment is about as long
-    as asked.
+    """States of dynamax' AR-HMM, without stickiness, and with one whose segments are as long as asked.
 
-    It sees principal directions of observations and controls, whitened, and predicts each step from the one
-    before.
+    It sees whitened principal directions of observations and controls, and predicts each step from the last.
 
     :param typical: the median steps that are asked for, of the segments of the training demonstrations.
     """
@@ -228,17 +211,13 @@ def autoregressive(
     from dynamax.hidden_markov_model import LinearAutoregressiveHMM
 
     jax.config.update("jax_enable_x64", True)
-    rows = [
-        np.concatenate([*demo.observations.values(), demo.actions], 1, dtype=float)
-        for demo in (*train, *valid)
-    ]
-    whitened = make_pipeline(StandardScaler(), PCA(DIRECTIONS, whiten=True)).fit(
-        np.concatenate(rows[: len(train)])
-    )
+    arrays = [[*demo.observations.values(), demo.actions] for demo in (*train, *valid)]
+    rows = [np.concatenate(own, 1, dtype=float) for own in arrays]
+    whitening = make_pipeline(StandardScaler(), PCA(DIRECTIONS, whiten=True))
+    whitened = whitening.fit(np.concatenate(rows[: len(train)]))
     rows = [whitened.transform(row) for row in rows]
-    after, before = (
-        np.concatenate([row[part] for row in rows[: len(train)]]) for part in (slice(1, None), slice(-1))
-    )
+    ours, parts = rows[: len(train)], (slice(1, None), slice(-1))
+    after, before = (np.concatenate([row[part] for row in ours]) for part in parts)
     tried = []
     for stickiness in STICKINESS:
         model = LinearAutoregressiveHMM(count, DIRECTIONS, transition_matrix_stickiness=stickiness)
@@ -252,7 +231,7 @@ def autoregressive(
 
 
 def _states(model: Any, learned: Any, rows: list[np.ndarray]) -> list[np.ndarray]:
-    """The states of each demonstration, from 1, of all as one sequence, as in the fit; the first is as the second."""
+    """The states of each demonstration, from 1, all as one sequence, as in the fit; the 1st as the 2nd."""
     after, before = (np.concatenate([row[part] for row in rows]) for part in (slice(1, None), slice(-1)))
     states = np.asarray(model.most_likely_states(learned, after, inputs=before)) + 1
     own = np.split(states, np.cumsum([len(row) - 1 for row in rows])[:-1])
@@ -268,27 +247,27 @@ def recognised(piece: Any) -> Iterator[tuple[Any, int]]:
     return zip(piece.recognised, piece.lengths, strict=True)
 
 
-def matched(kinds: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> list[np.ndarray]:
+Rows = Sequence[np.ndarray]
+"""A value of each step, of each demonstration."""
+
+
+def matched(kinds: Rows, truth: Rows) -> list[np.ndarray]:
     """Kinds as the labels that they are matched with, one for all demonstrations; -9 for none."""
     table = confusion(kinds, truth)
-    label = {
-        kind: -9 if name is None else name for kind, name in zip(table.options, table.matched, strict=True)
-    }
+    pairs = zip(table.options, table.matched, strict=True)
+    label = {kind: -9 if name is None else name for kind, name in pairs}
     return [np.array([label.get(kind, -9) for kind in own.tolist()]) for own in kinds]
 
 
-def scored(
-    named: Sequence[np.ndarray], kinds: Sequence[np.ndarray], truth: Sequence[np.ndarray]
-) -> dict[str, float]:
+def scored(named: Rows, kinds: Rows, truth: Rows) -> dict[str, float]:
     """Over labelled steps: the share that is right, the mean edit score, the NMI, segments in a
     demonstration, and F1 of segments and of boundaries.
     """
     known = [label >= 0 for label in truth]
     right = np.concatenate([(own == label)[at] for own, label, at in zip(named, truth, known, strict=True)])
     edits = [edit_score(own[at], label[at]) for own, label, at in zip(named, truth, known, strict=True)]
-    ours, theirs = (
-        np.concatenate([own[at] for own, at in zip(part, known, strict=True)]) for part in (kinds, truth)
-    )
+    pairs = (zip(part, known, strict=True) for part in (kinds, truth))
+    ours, theirs = (np.concatenate([own[at] for own, at in each]) for each in pairs)
     segments = [1 + int((np.diff(own[at]) != 0).sum()) for own, at in zip(kinds, known, strict=True)]
     found = agreement(named, truth)
     assert found is not None  # there are labels
@@ -308,9 +287,8 @@ def cells(own: argparse.Namespace) -> list[Cell]:
     for split, task in itertools.product(own.splits, own.tasks):
         demos = labelled_demonstrations(own.data / f"{task}.hdf5")
         names = folds(demos, split)
-        found += [
-            PeopleCell(str(own.data), task, fold, labelled) for fold in names for labelled in own.labelled
-        ]
+        data, each = str(own.data), itertools.product(names, own.labelled)
+        found += [PeopleCell(data, task, fold, labelled) for fold, labelled in each]
     return found
 
 

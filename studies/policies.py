@@ -45,8 +45,7 @@ class Settings:
     :param history: observations that the policy sees.
     :param power: of the error: 1 (L1) or 2 (squared).
     :param steps: gradient steps, the same for all policies.
-    :param batch: steps of demonstrations in a gradient step; whole demonstrations of about so many for an
-        LSTM.
+    :param batch: steps of demonstrations in a gradient step; an LSTM takes whole demonstrations.
     :param rate: learning rate, which falls to 0 by a cosine.
     :param decay: of weights.
     :param averaged: decay of the moving average of the weights, with which the policy acts; 0: the last ones.
@@ -71,9 +70,8 @@ class Settings:
         """
         for name in values.keys() - asdict(self).keys():
             raise BadInput(f"a policy has no setting {name!r}{nearest(name, asdict(self))}")
-        return replace(
-            self, **{name: tuple(one) if isinstance(one, list) else one for name, one in values.items()}
-        )
+        as_tuples = {name: tuple(one) if isinstance(one, list) else one for name, one in values.items()}
+        return replace(self, **as_tuples)
 
 
 KINDS = {
@@ -86,7 +84,7 @@ KINDS = {
 
 
 class Network(nn.Module):
-    """Features [N, ..., F] to chunks of controls [N, ..., C]; a flow gets the noisy chunk and its time among them."""
+    """Features [N, ..., F] to chunks of controls [N, ..., C]; a flow gets the noisy chunk and time, too."""
 
     def __init__(self, settings: Settings, features: int, size: int) -> None:
         super().__init__()

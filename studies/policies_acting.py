@@ -1,4 +1,4 @@
-"""Lets a policy of ``policies.py`` act with numpy alone. A written policy holds this file as its ``runner.py``."""
+"""Lets a policy of ``policies.py`` act with numpy alone. A written policy has this file as ``runner.py``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ EULER = 10
 """Steps from noise to a chunk of controls."""
 
 Arrays = Mapping[str, np.ndarray]
-"""Weights by their names in torch, and ``seen``, ``done`` [2, ...]: mean and standard deviation; ``range`` [2, A]."""
+"""Weights by their names in torch, and ``seen``, ``done`` [2, ...]: mean and deviation; ``range`` [2, A]."""
 
 
 def times(t: Any, numbers: Any = np) -> Any:
@@ -28,15 +28,13 @@ def times(t: Any, numbers: Any = np) -> Any:
 class Acting:
     """A policy: :meth:`reset`, then :meth:`act` with each observation.
 
-    :param about: ``keys`` of observations, ``history``, ``kind`` (``perceptron``, ``lstm`` or ``flow``),
-        ``chunk``.
+    :param about: ``keys`` observed, ``history``, ``kind`` (``perceptron``, ``lstm``, ``flow``), ``chunk``.
     """
 
     def __init__(self, about: Mapping[str, Any], arrays: Arrays) -> None:
         self.about, self.arrays = about, {name: array.astype(np.float32) for name, array in arrays.items()}
-        self._layers = [
-            name[: -len(".weight")] for name in arrays if name.startswith("layers.") and "weight" in name
-        ]
+        weights = [name for name in arrays if name.startswith("layers.") and "weight" in name]
+        self._layers = [name[: -len(".weight")] for name in weights]
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -50,9 +48,8 @@ class Acting:
         row = np.concatenate([np.ravel(observation[key]) for key in self.about["keys"]]).astype(np.float32)
         row = (row - mean) / std
         self._seen = [*(self._seen or [row] * self.about["history"]), row][-self.about["history"] :]
-        chunk = getattr(self, f"_{self.about['kind']}")(np.concatenate(self._seen)).reshape(
-            self.about["chunk"], -1
-        )
+        forward = getattr(self, f"_{self.about['kind']}")
+        chunk = forward(np.concatenate(self._seen)).reshape(self.about["chunk"], -1)
         mean, std = self.arrays["done"]
         return np.clip(chunk * std + mean, *self.arrays["range"]).astype(np.float64).ravel()
 
@@ -64,12 +61,9 @@ class Acting:
         return features
 
     def _lstm(self, features: np.ndarray) -> np.ndarray:
-        own = {
-            name: self.arrays[f"lstm.{name}_l0"] for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-        }
-        gates = (
-            own["weight_ih"] @ features + own["bias_ih"] + own["weight_hh"] @ self._hidden + own["bias_hh"]
-        )
+        names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+        of_input, of_state, bias, other = (self.arrays[f"lstm.{name}_l0"] for name in names)
+        gates = of_input @ features + bias + of_state @ self._hidden + other
         let_in, kept, new, let_out = np.split(gates, 4)
         self._cell = _sigmoid(kept) * self._cell + _sigmoid(let_in) * np.tanh(new)
         self._hidden = _sigmoid(let_out) * np.tanh(self._cell)

@@ -1,5 +1,4 @@
-"""PushT as the world of a study (``world: pusht:WORLD``): an environment of its own, and people's
-demonstrations.
+"""PushT as the world of a study (``world: pusht:WORLD``): its own environment, and people's demonstrations.
 
 The environment is made in ``runs/pusht/venv`` from ``pusht_requirements.txt``; ``pusht_gym.py`` runs in it.
 """

@@ -21,7 +21,7 @@ TIME = 300
 
 
 class PushT:
-    """Pushing the T; ``outcome`` has the largest part of the target that it covered, where 95 % count as all of it."""
+    """Pushing the T; ``outcome`` has the largest part of the target that it covered; 95 % count as all."""
 
     def __init__(self) -> None:
         self._world = PushTEnv()

@@ -1,7 +1,6 @@
 """Meta-World as the world of a study (``world: sawyer:WORLD``): an environment of its own.
 
-The environment is made in ``runs/metaworld/venv`` from ``arena_requirements.txt``; ``arena_metaworld.py``
-runs in it.
+The environment in ``runs/metaworld/venv`` is of ``arena_requirements.txt``; it runs ``arena_metaworld.py``.
 """
 
 from __future__ import annotations
@@ -21,13 +20,8 @@ class MetaWorld(World):
 
     def collect(self, task: str, seeds: range, count: int, path: Path) -> None:
         """Record the first successful episodes of the expert with noise on its controls."""
-        options = {
-            "number": count,
-            "held_out": 1,
-            "first": seeds.start,
-            "attempts": len(seeds),
-            "noise": NOISE,
-        }
+        options = {"number": count, "held_out": 1, "first": seeds.start, "attempts": len(seeds)}
+        options["noise"] = NOISE
         self.simulator.run("collect", task, path, **options)
 
 

@@ -18,10 +18,10 @@ from ddco_pyro.statistics import CONFIDENCE, mean_interval, rate, t_quantile
 from studies.declaration import ContrastSpec, Study
 
 COLUMNS = ["study", "task", "method", "demonstrations", "seed", "measure", "value"]
-"""All but ``value`` are text. ``demonstrations`` and ``seed`` are empty where a number does not depend on them."""
+"""All but ``value`` are text. ``demonstrations`` and ``seed`` are empty where a number has none."""
 
 CELL, ORIGIN = COLUMNS[1:5], ["key", "code"]
-"""The columns that name a cell; further ones of a study's table: the digest of its declaration, and the commit."""
+"""The columns that name a cell; further ones of a study's table: the declaration's digest, commit."""
 
 HOLDS, FAILS, NOT_TESTED, EQUIVALENCE = "holds", "does not hold", "not tested", "equivalence"
 LEVEL = (1 - CONFIDENCE) / 2
@@ -29,7 +29,7 @@ LEVEL = (1 - CONFIDENCE) / 2
 
 
 def read_tidy(path: Path) -> pd.DataFrame:
-    """A table with :data:`COLUMNS`, and with :data:`ORIGIN` where it has them; raises BadInput if it cannot be read."""
+    """A table with :data:`COLUMNS`, with :data:`ORIGIN` if it has them; BadInput where it cannot be read."""
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False).astype({"value": float})
         return table[[*COLUMNS, *(column for column in ORIGIN if column in table)]]
@@ -47,9 +47,8 @@ def earlier(study: Study) -> pd.DataFrame:
     for kept in study.declared.kept:
         table = read_tidy(study.path.parent / kept.table)
         of = {"seed": seeds, "study": kept.study and [kept.study], "method": [*kept.methods.values()]}
-        table = table[
-            np.all([table[column].isin(own or table[column]) for column, own in of.items()], axis=0)
-        ]
+        wanted = [table[column].isin(own or table[column]) for column, own in of.items()]
+        table = table[np.all(wanted, axis=0)]
         names = {"task": kept.tasks, "method": kept.methods, "measure": kept.measures}
         names_here = {column: {there: here for here, there in own.items()} for column, own in names.items()}
         table = table.replace(names_here).assign(study=study.path.stem)
@@ -61,7 +60,7 @@ def earlier(study: Study) -> pd.DataFrame:
 def values(
     table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | int], task: str | None
 ) -> pd.Series:
-    """The values of a method, or paired differences ``ours - theirs``, by ``task`` and ``seed``; ``counts`` of both."""
+    """Values of a method, or paired differences ``ours - theirs``, by task and seed; ``counts`` of both."""
     table = table[(table.measure == measure) & (table.task.eq(task) if task is not None else True)]
 
     def of(method: str, count: str | int) -> pd.Series:
@@ -78,8 +77,7 @@ def values(
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over tasks of means over seeds, its standard error and 95 % t interval; without spread these are
-    NaN.
+    """A mean over tasks of means over seeds, its standard error and 95 % t interval; NaN without spread.
 
     ``units`` are the means of the tasks or of their families, or the values of the seeds of a single one.
     """
@@ -91,18 +89,16 @@ class Estimate:
 
     @property
     def median(self) -> tuple[float, tuple[float, float]]:
-        """The median unit and its exact interval of at least 95 %, whatever the distribution; NaN below six units."""
+        """The median unit and its exact interval of at least 95 %, for any distribution; NaN below six."""
         middle = float(np.median(self.units))
         ends = quantile_test(self.units, q=middle, p=0.5).confidence_interval(CONFIDENCE)
         return middle, (float(ends.low), float(ends.high))
 
     def p_value(self, low: float, high: float = math.inf) -> float:
-        """The larger p-value of two one-sided t tests, of "the mean is at most ``low``" and of "at least ``high``"."""
+        """The larger p-value of two one-sided t tests: the mean is at most ``low``, and at least ``high``."""
         freedom = len(self.units) - 1
-        below, above = (
-            t.sf((self.value - low) / self.error, freedom),
-            t.cdf((self.value - high) / self.error, freedom),
-        )
+        below = t.sf((self.value - low) / self.error, freedom)
+        above = t.cdf((self.value - high) / self.error, freedom)
         return float(max(below, above))
 
 
@@ -141,7 +137,10 @@ def estimated(
     study: Study | None, table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | int],
     task: str | None = None, times: float = 1.0,
 ) -> Estimate | None:  # fmt: skip
-    """The mean of a method or of a contrast, some times as large; rates of a study have the trials of their starts."""
+    """The mean of a method or of a contrast, some times as large.
+
+    Rates of a study have the trials of their starts.
+    """
     own, starts = times * values(table, what, measure, counts, task), study and study.declared.starts
     trials = starts.test.count if starts and measure.startswith("success") and times == 1 else 0
     families, lowest = study.declared.families if study else {}, -1.0 if " - " in what else 0.0
@@ -171,15 +170,13 @@ def tested(study: Study, table: pd.DataFrame) -> list[Tested]:
     contrasts, counts = study.declared.contrasts, study.declared.demonstrations.counts
     asked = [(one, one.demonstrations or counts[0]) for one in contrasts]
     found = [estimated(study, table, one.contrast, one.measure, [number]) for one, number in asked]
-    p_values = [
-        own.p_value(*one.bounds) if own else math.nan for own, one in zip(found, contrasts, strict=True)
-    ]
-    places: dict[Any, int] = {
-        (one.kind, one.contrast, one.measure, count): n for n, (one, count) in enumerate(asked)
-    }
-    twins = {
-        n: places.get(("superiority", *facts)) for (kind, *facts), n in places.items() if kind == EQUIVALENCE
-    }
+    pairs = zip(found, contrasts, strict=True)
+    p_values = [own.p_value(*one.bounds) if own else math.nan for own, one in pairs]
+    places: dict[Any, int] = {}
+    for n, (one, count) in enumerate(asked):
+        places[one.kind, one.contrast, one.measure, count] = n
+    equal = [(facts, n) for (kind, *facts), n in places.items() if kind == EQUIVALENCE]
+    twins = {n: places.get(("superiority", *facts)) for facts, n in equal}
     judged = verdicts(p_values, study.declared.correction, twins)
     return [Tested(*one, own, *verdict) for one, own, verdict in zip(asked, found, judged, strict=True)]
 
@@ -197,19 +194,15 @@ def verdicts(
         it is reached where its twin is, and no other claim waits for it.
     """
     given = np.array(p_values, float)
-    known, beside = (
-        np.nan_to_num(given, nan=1.0),
-        {n: twin for n, twin in (twins or {}).items() if twin is not None},
-    )
+    known = np.nan_to_num(given, nan=1.0)
+    beside = {n: twin for n, twin in (twins or {}).items() if twin is not None}
     before, claims, contraries = np.zeros(len(known)), np.array(holm(given)), np.array(holm(1 - given))
     if correction == "fixed_sequence":
-        largest = np.maximum.accumulate(
-            [0.0, *(0.0 if place in beside else p for place, p in enumerate(known))]
-        )
+        alone = [0.0 if place in beside else p for place, p in enumerate(known)]
+        largest = np.maximum.accumulate([0.0, *alone])
         before = np.array([largest[beside.get(place, place)] for place in range(len(known))])
         claims, contraries = np.maximum(before, known), np.maximum(before, 1 - known)
     named = {"not reached": before > LEVEL, NOT_TESTED: np.isnan(given), HOLDS: claims <= LEVEL,
              FAILS: contraries <= LEVEL}  # fmt: skip
-    return [
-        *zip(np.select([*named.values()], [*named], "inconclusive").tolist(), claims.tolist(), strict=True)
-    ]
+    said = np.select([*named.values()], [*named], "inconclusive").tolist()
+    return list(zip(said, claims.tolist(), strict=True))

@@ -37,7 +37,7 @@ class Row(NamedTuple):
 
 
 def add(path: Path, rows: Iterable[Row]) -> None:
-    """Write rows into a table, in the place of those of the same cell and measure; another process may do so too."""
+    """Write rows into a table, in place of those of the same cell and measure; other processes may, too."""
     text = [(*("" if part is None else str(part) for part in row[:-1]), row[-1]) for row in rows]
     with only_one(path.parent, wait=True):
         tables = [read_tidy(path)] if path.exists() else []
@@ -48,7 +48,7 @@ def add(path: Path, rows: Iterable[Row]) -> None:
 
 @dataclass(frozen=True)
 class Settings:
-    """What all cells of a study share: numbers that decide a result, by the name of their option, and a folder."""
+    """What all cells of a study share: numbers that decide a result, by their option's name, and a folder."""
 
     values: Mapping[str, float]
     runs: Path
@@ -101,7 +101,7 @@ def described(text: str | None) -> argparse.ArgumentParser:
 
 
 def printed(work: Callable[[], str]) -> None:
-    """Print what work gives, or end with the line that says why it cannot be done: with 2 where the input is bad."""
+    """Print what work gives, or end with the line that says why it cannot be done: with 2 for bad input."""
     try:
         print(work())
     except (BadInput, Failed) as error:
@@ -131,14 +131,11 @@ def main(
     own = parser.parse_args()
 
     def work() -> str:
-        settings, wanted = (
-            Settings({name: getattr(own, name) for name in defaults.values}, own.runs),
-            [*asked(own)],
-        )
+        settings = Settings({name: getattr(own, name) for name in defaults.values}, own.runs)
+        wanted = [*asked(own)]
         if not wanted:
-            raise BadInput(
-                f"{Path(sys.argv[0]).name}: there is nothing to do: a list or a number is empty or 0"
-            )
+            why = "there is nothing to do: a list or a number is empty or 0"
+            raise BadInput(f"{Path(sys.argv[0]).name}: {why}")
         first(settings)
         calls = {cell.name: partial(cell.do, settings) for cell in wanted if cell.kept(settings) is None}
         with Progress() as progress:
@@ -146,9 +143,8 @@ def main(
         done = {cell: found for cell in wanted if (found := cell.kept(settings)) is not None}
         add(own.out, [row for cell, found in done.items() for row in cell.rows(found)])
         if len(done) < len(wanted):
-            raise Failed(
-                f"{len(wanted) - len(done)} of {len(wanted)} cells failed; the same command tries them again"
-            )
+            failed = f"{len(wanted) - len(done)} of {len(wanted)} cells failed"
+            raise Failed(f"{failed}; the same command tries them again")
         return f"{own.out}: has the numbers of {len(done)} cells"
 
     printed(work)
