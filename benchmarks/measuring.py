@@ -1,4 +1,4 @@
-"""Rows of a benchmark: two things measured side by side. All tables of ``docs/performance.md`` have this grammar."""
+"""Rows of a benchmark: two things measured side by side, as in the tables of ``docs/performance.md``."""
 
 from __future__ import annotations
 

@@ -21,14 +21,14 @@ NEVER = -1e3
 
 
 def transitions(chain: Chain) -> Tensor:
-    """log p(h_t | h_{t-1}) of a chain with one level, ready for an HMM, [N, T, S, S]; row t leads to step t."""
+    """log p(h_t | h_{t-1}) of a chain with one level, for an HMM, [N, T, S, S]; row t leads to step t."""
     keep, end = chain.termination[0].clamp(min=NEVER).unbind(-1)
     kept = torch.where(torch.eye(keep.shape[-1], dtype=torch.bool), keep.unsqueeze(-1), NEVER)
     return torch.logaddexp(end.unsqueeze(-1) + chain.selection[0].clamp(min=NEVER), kept)
 
 
 def dynamax_smoother(chain: Chain) -> Callable[[], float]:
-    """dynamax's jitted ``hmm_smoother`` with ready transition matrices: the sum of log-likelihoods, and posteriors."""
+    """dynamax's jitted ``hmm_smoother`` with ready transitions: sum of log-likelihoods, and posteriors."""
     import jax
     from dynamax.hidden_markov_model import hmm_smoother
 
@@ -37,9 +37,8 @@ def dynamax_smoother(chain: Chain) -> Callable[[], float]:
     matrices = jax.numpy.asarray(transitions(chain)[:, 1:].exp().numpy())
     emission = jax.numpy.asarray(chain.emission.numpy())
 
-    def smooth(
-        first, matrix, likelihood
-    ):  # the posteriors that our pass gives too: of choices and of transitions
+    # the posteriors that our pass gives too: of choices and of transitions
+    def smooth(first, matrix, likelihood):
         found = hmm_smoother(first, matrix, likelihood)
         return found.marginal_loglik, found.smoothed_probs, found.trans_probs
 
@@ -81,9 +80,8 @@ def funsor_elimination(chain: Chain) -> Tensor:
     funsor.set_backend("torch")
     funsor.util._JAX_COMPILED_FUNCTION_TYPE = ()  # funsor 0.4.8 fails where a recent jax is imported too
     factors = transitions(chain) + chain.emission.unsqueeze(2)
-    first = (chain.selection[0][:, 0] + chain.emission[:, 0].unsqueeze(1)).expand(
-        -1, chain.emission.shape[-1], -1
-    )
+    start = chain.selection[0][:, 0] + chain.emission[:, 0].unsqueeze(1)
+    first = start.expand(-1, chain.emission.shape[-1], -1)
     factors = torch.cat([(first - np.log(first.shape[1])).unsqueeze(1), factors[:, 1:]], 1).clamp(min=NEVER)
     sizes = factors.shape
     inputs = {
@@ -93,19 +91,15 @@ def funsor_elimination(chain: Chain) -> Tensor:
         "now": funsor.Bint[sizes[3]],
     }
     tensor = funsor.Tensor(factors, inputs)
-    whole = sequential_sum_product(
-        funsor.ops.logaddexp,
-        funsor.ops.add,
-        tensor,
-        funsor.Variable("time", funsor.Bint[sizes[1]]),
-        {"before": "now"},
-    )
+    time = funsor.Variable("time", funsor.Bint[sizes[1]])
+    adding = (funsor.ops.logaddexp, funsor.ops.add)
+    whole = sequential_sum_product(*adding, tensor, time, {"before": "now"})
     total = whole.reduce(funsor.ops.logaddexp, frozenset({"before", "now"})).reduce(funsor.ops.add, "n")
     return total.data
 
 
 def plain_hmm(number: int, steps: int, options: int = 5, controls: int = 3) -> tuple[Tables, Any, np.ndarray]:
-    """A hidden Markov model as our tables and as hmmlearn's, and controls [N·T, A]: options that see nothing."""
+    """A hidden Markov model as our tables and as hmmlearn's, and controls [N·T, A]: blind options."""
     from hmmlearn.hmm import GaussianHMM
 
     random = np.random.default_rng(0)

@@ -44,9 +44,8 @@ from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.restarts import Trainer
 
 ROOT = Path(__file__).parents[1]
-COMMAND = (
-    ROOT / ".venv/bin/ddco-pyro" if (ROOT / ".venv").exists() else Path(sys.executable).with_name("ddco-pyro")
-)
+INSTALLED = Path(sys.executable).with_name("ddco-pyro")
+COMMAND = ROOT / ".venv/bin/ddco-pyro" if (ROOT / ".venv").exists() else INSTALLED
 RESULTS, PAGE = ROOT / "benchmarks/results", ROOT / "docs/performance.md"
 RATIOS = ROOT / "docs/results/performance.csv"
 COLUMNS = ["study", "task", "method", "demonstrations", "seed", "measure", "value"]
@@ -94,11 +93,10 @@ def problem(
     kind: str = "gaussian",
     controls: int = CONTROLS,
 ) -> tuple[Hierarchy, Batch]:
-    """Freshly initialised networks over random observations and controls, of which a third is on a bound if clipped."""
+    """Freshly initialised networks over random observations and controls, a third on a bound if clipped."""
     torch.manual_seed(0)
-    levels = [
-        {"name": f"level-{d}", "count": k, "policy": {"network": network}} for d, k in enumerate(counts, 1)
-    ]
+    policy = {"network": network}
+    levels = [{"name": f"level-{d}", "count": k, "policy": policy} for d, k in enumerate(counts, 1)]
     std = {} if kind == "binary" else {"std": 0.5}
     spec = parse_spec(
         {
@@ -109,9 +107,8 @@ def problem(
         }
     )
     state, actions = np.random.default_rng(0).normal(size=(2, number, steps, FEATURES))
-    actions = {"gaussian": actions, "clipped": actions.clip(-1, 1), "binary": np.sign(actions)}[kind][
-        ..., :controls
-    ]
+    kinds = {"gaussian": actions, "clipped": actions.clip(-1, 1), "binary": np.sign(actions)}
+    actions = kinds[kind][..., :controls]
     demos = (Demonstration(f"demo_{row}", {"state": state[row]}, actions[row]) for row in range(number))
     return trained_on(spec, Demonstrations(tuple(demos)))
 
@@ -216,9 +213,8 @@ def inference() -> Iterator[Row]:
         tables, lengths = tables_of(number, steps)
         size, ours, chain = f"{number} × {steps}", kernel(tables, lengths), complete(tables, lengths)
         few = 1 if steps > 1000 else 5
-        yield side_by_side(
-            (f"Pyro enumeration {size}", "pass"), enumeration(tables, lengths), ours, few, warm=few > 1
-        )
+        names, theirs = (f"Pyro enumeration {size}", "pass"), enumeration(tables, lengths)
+        yield side_by_side(names, theirs, ours, few, warm=few > 1)
         same(ours(), float(peers.funsor_elimination(chain)))
         for name, peer in (
             ("dynamax smoother", peers.dynamax_smoother(chain)),
@@ -242,14 +238,11 @@ def growth() -> Iterator[Row]:
         names = f"{levels} levels of 5 options ({choices} joint choices)", "one level (6 choices)"
         yield side_by_side(names, kernel(*tables_of(50, 200, (5,) * levels)), short)
     deep = problem("linear", 50, 200, (5, 5, 5))
-    path, training = (
-        partial(most_likely_path, *tables_of(50, 200, (5, 5, 5))),
-        step(*deep, by_engine(deep[0])),
-    )
+    path = partial(most_likely_path, *tables_of(50, 200, (5, 5, 5)))
+    training = step(*deep, by_engine(deep[0]))
     yield side_by_side(("most likely path, 3 levels", "gradient step"), path, training)
-    steps = [
-        step(*case, by_engine(case[0])) for n in (9, 3) for case in [problem("linear", 50, 200, controls=n)]
-    ]
+    cases = (problem("linear", 50, 200, controls=n) for n in (9, 3))
+    steps = [step(*case, by_engine(case[0])) for case in cases]
     yield side_by_side(("step with 9 control dimensions", "3 dimensions"), *steps)
 
 
@@ -262,9 +255,8 @@ def threads() -> Iterator[Row]:
         torch.set_num_threads(number)
         ours()
 
-    yield side_by_side(
-        ("pass, one thread", "all threads"), partial(on, 1), partial(on, every), 15, time.perf_counter
-    )
+    both = (partial(on, 1), partial(on, every))
+    yield side_by_side(("pass, one thread", "all threads"), *both, 15, time.perf_counter)
     torch.set_num_threads(1)
     os.sched_setaffinity(0, {max(CORES)})
 
@@ -282,9 +274,8 @@ def memory() -> Iterator[Row]:
 
 
 def _in_process(*what: str) -> float:
-    ended = subprocess.run(
-        [sys.executable, __file__, "--peak", *what], capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, __file__, "--peak", *what]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
     return float(ended.stdout)
 
 
@@ -323,19 +314,14 @@ def em() -> Iterator[Row]:
     """
     with tempfile.TemporaryDirectory() as folder:
         spec = load_spec(initial_spec(Path(folder)))
-        train, tune = train_and_valid(spec, demonstrations(spec))["train"].split(
-            spec.training.tune_fraction, spec.seed
-        )
+        demos = train_and_valid(spec, demonstrations(spec))["train"]
+        train, tune = demos.split(spec.training.tune_fraction, spec.seed)
         traces = {}
         for name in ("em", "adam"):
             trace: list[tuple[float, float]] = []
             traces[name] = trace
-            budget = {
-                **ALONE,
-                "training.optimizer.name": name,
-                "training.layerwise": False,
-                "training.epochs": 1000,
-            }
+            budget = {**ALONE, "training.optimizer.name": name, "training.layerwise": False}
+            budget["training.epochs"] = 1000
             trainer = Trainer(with_overrides(spec, budget), Dimensions.of(train), train, tune)
             trainer.on_event = partial(_traced, trace)
             start = time.process_time()
@@ -343,9 +329,8 @@ def em() -> Iterator[Row]:
             traces[name] = [(1e3 * (at - start), value) for at, value in trace]
         best = max(value for _, value in traces["adam"])
         reached = next((at for at, value in traces["em"] if value >= best), float("nan"))
-        yield of_pairs(
-            ("Adam, until it converges", "EM, until as likely"), [(traces["adam"][-1][0], reached)]
-        )
+        names = ("Adam, until it converges", "EM, until as likely")
+        yield of_pairs(names, [(traces["adam"][-1][0], reached)])
     for number, steps in SIZES[:2]:
         ours, theirs = peers.em_steps(*problem("linear", number, steps))
         yield side_by_side((f"dynamax EM iteration {number} × {steps}", "EM iteration"), theirs, ours, 3)
@@ -357,7 +342,7 @@ def _traced(trace: list[tuple[float, float]], event: Event) -> None:
 
 
 def initial_spec(folder: Path) -> Path:
-    """What ``init`` writes for the demonstrations of ``$DEMONSTRATIONS``, or for made-up ones of their size."""
+    """What ``init`` writes for the demonstrations of ``$DEMONSTRATIONS``, or for made-up ones as large."""
     path, spec = Path(os.environ.get("DEMONSTRATIONS", folder / "made.hdf5")).resolve(), folder / "init.yaml"
     if not path.exists():
         made(path)
@@ -395,10 +380,8 @@ def fits() -> Iterator[Row]:
         data["training"]["epochs"] = 40
         needle.write_text(yaml.safe_dump(data))
         subprocess.run([COMMAND, "collect", needle, "--out", collected], check=True, capture_output=True)
-        for what, spec in (
-            ("needle 100 × 15, 40 epochs", needle),
-            ("init's spec 50 × 60", initial_spec(folder)),
-        ):
+        of_init = ("init's spec 50 × 60", initial_spec(folder))
+        for what, spec in (("needle 100 × 15, 40 epochs", needle), of_init):
             runs = [_fit(spec, folder, cache) for cache in ("cache", "cache")]
             for clock, unit in enumerate(("wall", "CPU")):
                 names = f"fit {what}, nothing compiled, {unit}", "compiled before"
@@ -424,15 +407,14 @@ def _fit(spec: Path, folder: Path, cache: str) -> tuple[float, float]:
 
 
 def large() -> Iterator[Row]:
-    """``init`` and ``fit`` from the shell of as much as a robot with two arms records, with three baselines."""
+    """``init`` and ``fit`` from the shell of as much as a two-armed robot records, with three baselines."""
     with tempfile.TemporaryDirectory() as name:
         path, spec = Path(name) / "made.hdf5", Path(name) / "init.yaml"
         made(path, *LARGE, scale=0.2, kept=0.99)  # a tenth of the controls are on a bound
         cpu, peak = 0.0, 0.0
         for arguments in (["init", path, "--out", spec], ["fit", spec, "--out", Path(name) / "run"]):
-            child = subprocess.Popen(
-                [COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-            )
+            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            child = subprocess.Popen([COMMAND, *arguments], **quiet)
             _, status, used = os.wait4(child.pid, 0)
             assert status == 0
             cpu, peak = cpu + used.ru_utime + used.ru_stime, max(peak, used.ru_maxrss / 1024)
@@ -465,10 +447,8 @@ def measure(part: str, again: bool) -> None:
     rows = []
     for row in PARTS[part]():
         rows.append(row._asdict())
-        print(
-            f"{part}: {row.first} {row.value:.3g} {row.unit}, {row.second} {row.other:.3g}: {row.ratio:.3g}",
-            flush=True,
-        )
+        ours, theirs = f"{row.first} {row.value:.3g} {row.unit}", f"{row.second} {row.other:.3g}"
+        print(f"{part}: {ours}, {theirs}: {row.ratio:.3g}", flush=True)
     RESULTS.mkdir(exist_ok=True)
     path.write_text(text({"rows": rows}, made_by))
 
@@ -495,19 +475,14 @@ def ratios() -> Iterator[dict[str, Any]]:
     """All kept ratios as rows of a tidy table; the method is what was measured."""
     for part, _, rows in known():
         for row in rows:
-            yield {
-                "study": part,
-                "method": row.first,
-                "measure": f"over {row.second}",
-                "value": f"{row.ratio:.4g}",
-            }
+            named = {"study": part, "method": row.first, "measure": f"over {row.second}"}
+            yield {**named, "value": f"{row.ratio:.4g}"}
 
 
 def main() -> None:
     """Measure the parts that are named, or all that are not known."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--peak", nargs=2, help=argparse.SUPPRESS)
     asked = parser.parse_args()

@@ -44,11 +44,8 @@ def made(number: int, steps: int) -> Demonstrations:
 
     def one(index: int) -> Demonstration:
         camera = random.integers(0, 256, (steps, *SIZE), dtype=np.uint8)
-        return Demonstration(
-            f"demo_{index}",
-            {"pose": random.normal(size=(steps, 3)), "camera": camera},
-            random.normal(size=(steps, 3)),
-        )
+        seen = {"pose": random.normal(size=(steps, 3)), "camera": camera}
+        return Demonstration(f"demo_{index}", seen, random.normal(size=(steps, 3)))
 
     return Demonstrations(tuple(one(index) for index in range(number)))
 
@@ -100,7 +97,7 @@ def epoch(demos: Demonstrations) -> float:
 
 
 def networks_alone(demos: Demonstrations) -> Callable[[], float]:
-    """Forward and backward of the same networks with a sum as loss, Adam, and forward alone where an epoch tunes."""
+    """Forward and backward of the same networks with a sum as loss, Adam, and forward where it tunes."""
     material = trainer(demos).data
     model = material.hierarchy(0).train()
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-3, fused=True)
@@ -128,33 +125,17 @@ def networks_alone(demos: Demonstrations) -> Callable[[], float]:
 
 def chunks() -> Iterator[Row]:
     """A gradient of 240 pictures of 64 × 64 in eight chunks of time, over the same in one piece."""
-    conv = {
-        "network": "conv",
-        "layers": [{"filters": 8, "kernel": 5, "stride": 2, "padding": 2}],
-        "hidden": [32],
-    }
-    ends = {
-        "network": "conv",
-        "layers": [{"filters": 2, "kernel": 5, "stride": 2, "padding": 2}],
-        "hidden": [],
-    }
+    layer = {"kernel": 5, "stride": 2, "padding": 2}
+    conv = {"network": "conv", "layers": [{"filters": 8, **layer}], "hidden": [32]}
+    ends = {"network": "conv", "layers": [{"filters": 2, **layer}], "hidden": []}
     steps, random = 240, np.random.default_rng(0)
     camera = random.integers(256, size=(steps, 64, 64, 3), dtype=np.uint8)
     demos = Demonstrations((Demonstration("demo_0", {"camera": camera}, random.normal(size=(steps, 3))),))
-    for name, policy in {
-        "conv": conv,
-        "lstm over conv": {"network": "lstm", "over": conv, "hidden": 32},
-    }.items():
-        spec = parse_spec(
-            {
-                "demonstrations": {"path": "unused.hdf5"},
-                "observations": ["camera"],
-                "hierarchy": {
-                    "levels": [{"count": 3, "policy": policy, "termination": ends}],
-                    "meta_policy": ends,
-                },
-            }
-        )
+    policies = {"conv": conv, "lstm over conv": {"network": "lstm", "over": conv, "hidden": 32}}
+    for name, policy in policies.items():
+        level = {"count": 3, "policy": policy, "termination": ends}
+        of_pictures = {"demonstrations": {"path": "unused.hdf5"}, "observations": ["camera"]}
+        spec = parse_spec({**of_pictures, "hierarchy": {"levels": [level], "meta_policy": ends}})
         made_for = Trainer(spec, Dimensions.of(demos), demos, demos)
         model, batch = made_for.hierarchy, made_for.data.train
 

@@ -19,9 +19,8 @@ Record = dict[str, Any]
 def record(command: str, root: Path = ROOT) -> Record:
     """The code that is about to measure. Call it before the work starts."""
     paths = sorted(path for folder in CODE for path in (root / folder).rglob("*.py"))
-    contents = {
-        path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths
-    }
+    digests = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    contents = {path.relative_to(root).as_posix(): digest for path, digest in digests.items()}
     code = hashlib.sha256(json.dumps(contents).encode()).hexdigest()
     commit = _git(root, "rev-parse", "--short", "HEAD")
     dirty = None if commit is None else bool(_git(root, "status", "--porcelain", "--", *CODE))

@@ -46,7 +46,7 @@ def one_fold() -> dict[str, Any]:
 
 
 def speed_up() -> dict[str, Any]:
-    """Seconds of the clock that a short selection takes with one process and with two, starting them left out."""
+    """Seconds of the clock of a short selection with one process and with two, starting them left out."""
     spec = load_spec("specs/needle.yaml", [*SHORT, "training.patience=null"])
     demonstrations(spec)  # collected before the clock starts
     found: dict[str, Any] = {"load_before": os.getloadavg()[0]}
@@ -74,9 +74,8 @@ class Clock:
 
 def main() -> None:
     """Measure."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("what", choices=["folds", "speed-up"])
     what = parser.parse_args().what
     found = one_fold() if what == "folds" else speed_up()

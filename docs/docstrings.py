@@ -1,4 +1,4 @@
-"""Docstrings as Markdown for mkdocstrings: examples become code, and roles such as ``:func:`` become names."""
+"""Docstrings as Markdown for mkdocstrings: examples become code, roles such as ``:func:`` become names."""
 
 from __future__ import annotations
 

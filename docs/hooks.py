@@ -112,9 +112,9 @@ def spec_page() -> str:
     """Every key of a spec: what it is, what it takes, what it is without."""
     schema = spec_schema()
     about = (
-        "A spec is a YAML file. Unknown keys, wrong types and values out of range are one line each, with the nearest "
-        "valid key. `ddco-pyro check SPEC` prints a spec with all its defaults, `ddco-pyro check --schema` the JSON "
-        "Schema that this page is made from."
+        "A spec is a YAML file. Unknown keys, wrong types and values out of range are one line each, with "
+        "the nearest valid key. `ddco-pyro check SPEC` prints a spec with all its defaults, `ddco-pyro check "
+        "--schema` the JSON Schema that this page is made from."
     )
     parts = [f"# The spec\n\n{about}\n"]
     parts += _section("", schema, schema["$defs"])

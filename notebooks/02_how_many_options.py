@@ -38,10 +38,8 @@ SMALLER = os.environ.get("NOTEBOOK_SMALLER", "").split()  # a test makes the fit
 # `ddco-pyro select specs/needle.yaml --set selection.grid.hierarchy.levels.0.count=[1,2,3,5,8] --folds 5`.
 
 # %%
-LINEAR = [
-    f"hierarchy.{place}.network=linear"
-    for place in ("levels.0.policy", "levels.0.termination", "meta_policy")
-]
+PLACES = ("levels.0.policy", "levels.0.termination", "meta_policy")
+LINEAR = [f"hierarchy.{place}.network=linear" for place in PLACES]
 GRID = ["selection.folds=5", "selection.grid.hierarchy.levels.0.count=[1, 2, 3, 5, 8]", "training.epochs=600"]
 spec = load_spec("../specs/needle.yaml", [*LINEAR, *GRID, "compare_with=[]", *SMALLER])
 

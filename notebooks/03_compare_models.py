@@ -38,15 +38,9 @@ with Progress() as watch:
     five = fit(load_spec("../specs/needle.yaml", SMALLER), None, RUNS / "needle", watch)
     two = fit(load_spec("../specs/needle.yaml", ["hierarchy.levels.0.count=2", "compare_with=[]", *SMALLER]),
               None, RUNS / "two-options", watch)  # fmt: skip
-    hybrid = fit(
-        load_spec("../specs/needle_hybrid.yaml", ["compare_with=[]", *SMALLER]), None, RUNS / "hybrid", watch
-    )
-    deep = fit(
-        load_spec("../specs/needle_3level.yaml", ["compare_with=[]", *SMALLER]),
-        None,
-        RUNS / "3-levels",
-        watch,
-    )
+    alone = ["compare_with=[]", *SMALLER]
+    hybrid = fit(load_spec("../specs/needle_hybrid.yaml", alone), None, RUNS / "hybrid", watch)
+    deep = fit(load_spec("../specs/needle_3level.yaml", alone), None, RUNS / "3-levels", watch)
 
 # %% [markdown] At the command line: `ddco-pyro compare runs/needle runs/needle/baselines/flat ...`. The
 # columns are those of arviz's `compare`, with trajectories for observations; `dse` is the error of a *paired*

@@ -120,9 +120,8 @@ if which("dot") and find_spec("graphviz"):
     display(pyro.render_model(ahmm, model_args=short))
 else:
     relations = get_model_relations(ahmm, short)
-    graph = nx.DiGraph(
-        [(cause, site) for site, causes in relations["sample_sample"].items() for cause in causes]
-    )
+    causes = relations["sample_sample"].items()
+    graph = nx.DiGraph([(cause, site) for site, own in causes for cause in own])
     figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
     nx.draw_networkx(
         graph,
@@ -232,9 +231,8 @@ for guided in (AutoNormal, AutoLowRankMultivariateNormal):
     losses = [svi.step(batch) for _ in range(600)]
     print(f"{guided.__name__}: ELBO {-np.mean(losses[-200:]):.1f} nats")
     with torch.no_grad():
-        samples[guided.__name__] = Predictive(bayesian, guide=guide, num_samples=300, return_sites=[*start])(
-            batch
-        )
+        predictive = Predictive(bayesian, guide=guide, num_samples=300, return_sites=[*start])
+        samples[guided.__name__] = predictive(batch)
 
 # %%
 pyro.set_rng_seed(0)
@@ -274,9 +272,8 @@ for place_of, (name, drawn) in enumerate(samples.items()):
     low, middle, high = every.quantile(torch.tensor([0.05, 0.5, 0.95]).double(), dim=0)
     at = np.arange(every.shape[1]) + 0.2 * (place_of - 1)
     axes.errorbar(at, middle, (middle - low, high - middle), fmt="o", markersize=4, label=name)
-labels = [
-    f"{symbol} {kind} {option}" for symbol in "πψη" for kind in ("weight", "bias") for option in (1, 2, 3)
-]
+parts = [f"{symbol} {kind}" for symbol in "πψη" for kind in ("weight", "bias")]
+labels = [f"{part} {option}" for part in parts for option in (1, 2, 3)]
 axes.set_xticks(range(18), labels, rotation=60)
 axes.set_title("weights and biases by option: median and 90 % interval")
 axes.legend()
@@ -296,9 +293,8 @@ shares = (paths[..., None] == [1, 2, 3]).mean((1, 2))
 for least in (0.0, 0.02, 0.05, 0.1):
     three = torch.from_numpy((shares > least).all(1)).double()
     error = 0.0 if three.std() == 0 else three.std() / effective_sample_size(three[None]) ** 0.5
-    print(
-        f"three options with more than {least:3.0%} of the steps: P = {three.mean():.2f}, standard error {error:.2f}"
-    )
+    said = f"P = {three.mean():.2f}, standard error {error:.2f}"
+    print(f"three options with more than {least:3.0%} of the steps: {said}")
 
 # %% [markdown] There are two skills. Nothing in these priors prefers few options, and many draws give a few
 # steps to a third one. It seldom has a tenth of the steps. The chain moves slowly between weights with much
@@ -323,10 +319,8 @@ for name in ("drawn anew", "drawn anew, memoryless"):
     for t in range(T):
         x = torch.from_numpy(hierarchy.encoder.scaled(here)).float()
         normal = Gaussian((policy * x + policy_bias)[:, None, :, None], torch.tensor([STD]), torch.zeros(1))
-        callers = (
-            CallerOutputs(0, None, normal),
-            CallerOutputs(3, (meta * x + meta_bias)[:, None, None], None),
-        )
+        selection = (meta * x + meta_bias)[:, None, None]
+        callers = (CallerOutputs(0, None, normal), CallerOutputs(3, selection, None))
         ending = (termination * x + termination_bias)[:, None] if name == "drawn anew" else None
         now = complete(Outputs(callers, (ending,)).tables(), torch.ones(D * N, dtype=torch.long)).steps()[0]
         options = choose(t, now, options)
@@ -393,23 +387,20 @@ plt.show()
 # %%
 pyro.set_rng_seed(3)
 R, M, STEPS = 400, 150, 15
-center = torch.tensor(
-    [0.0, 0.0, 1.0, -1.0, -1.0, -1.0, 0.0]
-)  # slopes, biases, ψ and η: options cannot be exchanged
+# slopes, biases, ψ and η: options cannot be exchanged
+center = torch.tensor([0.0, 0.0, 1.0, -1.0, -1.0, -1.0, 0.0])
 candidates = center + 0.6 * torch.randn(R, M, 7)
 slope, bias, ending, first = candidates.reshape(R * M, 1, 7).split([2, 2, 2, 1], dim=-1)
 states = torch.randn(R, 1, STEPS, 1).expand(R, M, STEPS, 1).reshape(R * M, STEPS, 1)
 lengths = torch.full((R * M,), STEPS)
-options = CallerOutputs(
-    0, None, Gaussian((slope * states + bias).unsqueeze(-1), torch.tensor([0.5]), torch.zeros(1))
-)
+gaussian = Gaussian((slope * states + bias).unsqueeze(-1), torch.tensor([0.5]), torch.zeros(1))
+options = CallerOutputs(0, None, gaussian)
 choice = CallerOutputs(2, torch.cat([first, -first], -1).unsqueeze(2).expand(-1, STEPS, 1, 2), None)
 ended = ending.expand(-1, STEPS, 2)
 lasting = EliminatedAHMM(Outputs((options, choice), (ended,)), lengths)
 memoryless = EliminatedAHMM(Outputs((options, choice), (None,)), lengths)
-simulated = (
-    lasting.sample().float().reshape(R, M, STEPS, 1)[:, :1].expand(R, M, STEPS, 1).reshape(R * M, STEPS, 1)
-)
+first_of_each = lasting.sample().float().reshape(R, M, STEPS, 1)[:, :1]
+simulated = first_of_each.expand(R, M, STEPS, 1).reshape(R * M, STEPS, 1)
 
 figure, panels = plt.subplots(1, 2, figsize=(10, 2.8), sharey=True, layout="constrained")
 for axes, name, model in zip(panels, ("EliminatedAHMM", "memoryless"), (lasting, memoryless), strict=True):

@@ -1,4 +1,4 @@
-"""Simulated tasks for ddco-pyro, each a :class:`ddco_pyro.simulation.task.Task` (import name ``ddco_tasks``)."""
+"""Simulated tasks, each a :class:`ddco_pyro.simulation.task.Task` (import name ``ddco_tasks``)."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class ArmPhysics(mujoco.Physics):
         self._from, self._to = self._to, np.concatenate([joints, [jaw / 2, jaw / 2]])
 
     def step(self, nstep: int = 1) -> None:
-        """One control step of ``nstep`` time steps: to the goal along smoothly interpolated set points, then settle."""
+        """One control step of ``nstep`` time steps: to the goal along smooth set points, then settle."""
         block = round(SET_POINT_TIME / self.timestep())
         for start in range(0, nstep, block):
             fraction = min(1.0, (start + block) * self.timestep() / self.move_time)

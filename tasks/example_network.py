@@ -1,4 +1,4 @@
-"""A worked example of one's own network; ``network: ddco_tasks.example_network:Radial`` in a spec names it."""
+"""A worked example of one's own network; specs name it by ``network: ddco_tasks.example_network:Radial``."""
 
 from __future__ import annotations
 

@@ -20,9 +20,8 @@ MOST_DEVICES = 10
 
 def has_display() -> bool:
     """Whether a window system could give an OpenGL context."""
-    return not sys.platform.startswith("linux") or bool(
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    )
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return not sys.platform.startswith("linux") or bool(display)
 
 
 def missing() -> str | None:
@@ -30,9 +29,8 @@ def missing() -> str | None:
 
     Another renderer than EGL (``MUJOCO_GL``), or a window system, is taken to work.
     """
-    if os.environ.get("MUJOCO_GL", "egl").lower() != "egl" or (
-        has_display() and "MUJOCO_GL" not in os.environ
-    ):
+    chosen = os.environ.get("MUJOCO_GL", "egl").lower()
+    if chosen != "egl" or (has_display() and "MUJOCO_GL" not in os.environ):
         return None
     if not any(map(_loads, OPENGL)):
         return f"{OPENGL[0]} cannot be loaded"

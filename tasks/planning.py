@@ -80,9 +80,8 @@ def plan_path(
     iterations = itertools.count()
     setup.solve(base.PlannerTerminationCondition(lambda: next(iterations) >= ITERATIONS))
     if not setup.haveExactSolutionPath():
-        raise NoPath(
-            f"no path from {np.round(start, 3)} to {np.round(goal, 3)} within {ITERATIONS} iterations"
-        )
+        ends = f"from {np.round(start, 3)} to {np.round(goal, 3)}"
+        raise NoPath(f"no path {ends} within {ITERATIONS} iterations")
     path = setup.getSolutionPath()
     _simplify(path, information, settings.shortcuts)
     return np.array([_to_array(path.getState(corner), joints) for corner in range(path.getStateCount())])

@@ -94,11 +94,8 @@ def inverse(pose: Pose) -> np.ndarray:
     pitch = np.arcsin(direction[1])
     yaw = np.arctan2(-direction[0], -direction[2])
     rest = (BASE @ rotation(1, yaw) @ rotation(0, pitch)).T @ pose.rotation
-    wrist_angles = (
-        np.arctan2(-rest[0, 1], rest[1, 1]),
-        np.arcsin(rest[2, 1]),
-        np.arctan2(-rest[2, 0], rest[2, 2]),
-    )
+    last = np.arctan2(-rest[2, 0], rest[2, 2])
+    wrist_angles = (np.arctan2(-rest[0, 1], rest[1, 1]), np.arcsin(rest[2, 1]), last)
     return np.array([yaw, pitch, insertion, *wrist_angles])
 
 
@@ -118,9 +115,8 @@ def encoder_error(joints: np.ndarray) -> np.ndarray:
     across, along = joints[0] / 0.3, joints[1] / 0.3  # -1 ... 1 over the workspace
     depth = (joints[2] - 0.15) / 0.03
     region = np.sin(1.1 * across - 1.3 * along + 0.4 * depth + 0.5)
-    size = ERROR_SMALL + (ERROR_LARGE - ERROR_SMALL) / (
-        1.0 + np.exp(-ERROR_SHARPNESS * (region - ERROR_BORDER))
-    )
+    part = 1.0 + np.exp(-ERROR_SHARPNESS * (region - ERROR_BORDER))
+    size = ERROR_SMALL + (ERROR_LARGE - ERROR_SMALL) / part
     heading = 1.3 * across + 1.1 * along - 0.6
     elevation = 0.5 * np.sin(0.9 * across - 0.7 * along + 0.8)
     sideways = size * np.cos(elevation) / RCM_DISTANCE
@@ -142,7 +138,7 @@ def true_joints(encoders: np.ndarray) -> np.ndarray:
 
 
 def encoder_readings(joints: np.ndarray) -> np.ndarray:
-    """What the encoders read [6] with the joints truly at ``joints`` [6]: the inverse of :func:`true_joints`."""
+    """What the encoders read [6] with the joints truly at ``joints`` [6]: inverse of :func:`true_joints`."""
     encoders = joints - encoder_error(joints)
     for _ in range(20):  # a contraction: the error varies by far less than the joints do
         encoders = joints - encoder_error(encoders)

@@ -44,9 +44,8 @@ class DDCOPolicy(PreTrainedPolicy):
         """
         folder = Path(pretrained_name_or_path)
         if not (folder / "runner.py").is_file():
-            raise ValueError(
-                f"{folder}: has no runner.py; export one with: ddco-pyro export RUN --lerobot FOLDER"
-            )
+            remedy = "export one with: ddco-pyro export RUN --lerobot FOLDER"
+            raise ValueError(f"{folder}: has no runner.py; {remedy}")
         return cls(config or PreTrainedConfig.from_pretrained(folder), folder).eval()
 
     def reset(self) -> None:

@@ -21,10 +21,9 @@ def make_ddco_pre_post_processors(
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """The controller scales by itself, so statistics of a dataset are not used."""
     before = [RenameObservationsProcessorStep(rename_map={}), AddBatchDimensionProcessorStep()]
+    ready = [*before, DeviceProcessorStep(device=config.device)]
     return (
-        PolicyProcessorPipeline(
-            [*before, DeviceProcessorStep(device=config.device)], name="policy_preprocessor"
-        ),
+        PolicyProcessorPipeline(ready, name="policy_preprocessor"),
         PolicyProcessorPipeline(
             [DeviceProcessorStep(device="cpu")],
             name="policy_postprocessor",

@@ -29,7 +29,7 @@ def observed(whole: np.ndarray) -> np.ndarray:
 
 
 def matched(whole: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """The pixel [2] of the right eye that shows what is at ``pixel`` [2] of the left one, along the same row."""
+    """The pixel [2] of the right eye that shows what is at ``pixel`` [2] of the left one, on the same row."""
     column, row = np.round(pixel).astype(int)
     padded = np.pad(whole, ((WINDOW, WINDOW), (WINDOW + DISPARITY + SEARCH,) * 2, (0, 0)))
     rows = slice(row, row + 2 * WINDOW + 1)

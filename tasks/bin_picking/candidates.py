@@ -41,7 +41,7 @@ class Candidate:
 
 
 def draw(mask: np.ndarray, random: np.random.RandomState, count: int = DRAWN) -> list[Candidate]:
-    """Points drawn on a mask uint8 [H, W], moved to the axis of the wire there; none where too little is seen."""
+    """Points drawn on a mask uint8 [H, W], moved to the axis of the wire; none where too little is seen."""
     rows, columns = np.nonzero(mask)
     if len(rows) < FEWEST_PIXELS:
         return []

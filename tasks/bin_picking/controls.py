@@ -19,9 +19,8 @@ from ddco_pyro.simulation.task import Observation, Policy
 
 from .. import psm
 
-REACH = 1e3 * (
-    psm.JOINT_RANGES[2, 1] + psm.WRIST_LENGTH + psm.JAW_LENGTH
-)  # mm, from the remote centre of motion
+# mm, from the remote centre of motion
+REACH = 1e3 * (psm.JOINT_RANGES[2, 1] + psm.WRIST_LENGTH + psm.JAW_LENGTH)
 JAW = "jaw"
 
 
@@ -44,9 +43,8 @@ class Controls:
     def spec(self) -> specs.BoundedArray:
         """Of a control [A]; the jaw opens above one half and closes otherwise."""
         limits = np.vstack([self.ranges, [0.0, 1.0]])
-        return specs.BoundedArray(
-            (len(limits),), float, limits[:, 0], limits[:, 1], name=",".join((*self.names, JAW))
-        )
+        name = ",".join((*self.names, JAW))
+        return specs.BoundedArray((len(limits),), float, limits[:, 0], limits[:, 1], name=name)
 
     def joints(self, control: np.ndarray) -> np.ndarray:
         """The joints [6] of a control [A], each within its limits; NaN where there are none."""
@@ -108,9 +106,8 @@ def _of_matrix(numbers: np.ndarray) -> np.ndarray:
 
 def _to_matrix(joints: np.ndarray) -> np.ndarray:
     pose = psm.forward(joints)
-    return np.concatenate(
-        [pose.position * 1e3, pose.rotation.ravel().clip(-1, 1)]
-    )  # rounding may lead beyond
+    # rounding may lead beyond
+    return np.concatenate([pose.position * 1e3, pose.rotation.ravel().clip(-1, 1)])
 
 
 _POSITION = np.stack([1e3 * psm.RCM - REACH, 1e3 * psm.RCM + REACH], axis=1)
@@ -131,4 +128,4 @@ MATRIX = Controls(
     _of_matrix,
     _to_matrix,
 )
-"""Position (mm) of the gripper and its rotation matrix, by rows; of other matrices the nearest rotation counts."""
+"""Position (mm) of the gripper and its rotation matrix, by rows; for other matrices the nearest rotation."""

@@ -36,12 +36,10 @@ from .trials import MOST_STEPS, Attempt, End, Trials, most_attempts
 
 HERE = Path(__file__).parent
 FEWEST, MOST = 3, 8  # objects in a bin
-REPEATABILITY = np.array(
-    [6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3]
-)  # rad, m: standard deviations, 0.2 mm at the gripper
-JAW_ERROR = (
-    0.01  # rad: standard deviation of the angle that the jaws' encoder reads, as the backlash of the wrist
-)
+# rad, m: standard deviations, 0.2 mm at the gripper
+REPEATABILITY = np.array([6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3])
+# rad: standard deviation of the angle that the jaws' encoder reads, as the backlash of the wrist
+JAW_ERROR = 0.01
 LIFTED_HEIGHT = 0.018  # m: a gripper above this has lifted what it holds
 BIN_SEEN = in_bin(lying_at(np.stack(np.meshgrid(*2 * [np.arange(IMAGE_SIZE, dtype=float)]), axis=-1)))
 FRAME_SIZE = (360, 480)
@@ -114,13 +112,11 @@ class BinPicking(base.Task):
 
     def _end_trial(self, physics: Physics, released: bool) -> None:
         places, lifted = physics.places(), self.lifted or frozenset()
-        held = (self._held if released else physics.held()) & (
-            self.remaining | lifted
-        )  # not what lies in a cup
+        own = self._held if released else physics.held()
+        held = own & (self.remaining | lifted)  # not what lies in a cup
         where = [places[number] for number in sorted(held)] or [physics.gripper_place()]
-        self.trials.add(
-            Attempt(len(self.remaining), lifted, held, tuple(where) if released else (), self.trials.steps)
-        )
+        found = tuple(where) if released else ()
+        self.trials.add(Attempt(len(self.remaining), lifted, held, found, self.trials.steps))
         self.lifted = None
         self.remaining = frozenset(number for number, place in enumerate(places) if place not in CUPS)
         if not self.remaining:
@@ -207,9 +203,8 @@ def load(
     """
     random = np.random.RandomState(seed)
     if kinds is None:
-        kinds = [
-            KINDS[number] for number in random.randint(len(KINDS), size=random.randint(FEWEST, MOST + 1))
-        ]
+        drawn = random.randint(len(KINDS), size=random.randint(FEWEST, MOST + 1))
+        kinds = [KINDS[number] for number in drawn]
     physics = Physics.from_xml_string(scene(HERE / "bin_picking.xml", kinds))
     physics.instrument = Instrument.numbered(instrument)
     sub_steps = round((MOVE_TIME + SETTLE_TIME) / physics.timestep())
@@ -223,7 +218,7 @@ RATES = {"success", "cleared"}
 def make_task(
     name: str, instrument: int = 1, controls: Controls = JOINTS, kinds: tuple[str, ...] | None = None
 ) -> Task:
-    """The task with the instrument of that number in the arm, controls of that form, and objects of these kinds."""
+    """The task with the instrument of that number, controls of that form, and objects of these kinds."""
     shared = (HERE.parent / name for name in SHARED_SOURCES)
     scripted = {"open_loop": supervisor.OpenLoop, "supervisor": supervisor.Supervisor}
     return Task(

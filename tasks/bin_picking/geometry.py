@@ -35,7 +35,7 @@ OBJECT_HEIGHT = 0.001  # of what lies on the floor; its depth in the pictures is
 
 
 def upright(turn: float, position: np.ndarray) -> Pose:
-    """A gripper that points straight down at ``position`` [3] and is turned by ``turn`` (rad) about the vertical."""
+    """A gripper pointing straight down at ``position`` [3], turned by ``turn`` (rad) about the vertical."""
     return Pose(rotation(2, turn), position)
 
 
@@ -69,6 +69,5 @@ def place_of(position: np.ndarray) -> str:
     """Where a point [3] is: ``bin``, ``accept``, ``reject``, or ``outside`` of all of them."""
     if in_bin(position):
         return "bin"
-    return next(
-        (name for name, cup in CUPS.items() if np.all(np.abs(position[:2] - cup) < CUP_INSIDE)), "outside"
-    )
+    inside = (name for name, cup in CUPS.items() if np.all(np.abs(position[:2] - cup) < CUP_INSIDE))
+    return next(inside, "outside")

@@ -15,7 +15,7 @@ import numpy as np
 from .. import psm
 
 BACKLASH = np.array([0.0015, 0.0015, 0.00015, 0.01, 0.01, 0.01])
-"""By how much a motor can run ahead of its joint in either direction: 0.26 mm at the gripper for the first two."""
+"""By how much a motor can run ahead of its joint, either way: 0.26 mm at the gripper for the first two."""
 BIAS = np.array([0.015, 0.015, 0.001, 0.03, 0.03, 0.03])
 """Standard deviations between instruments: 2.6 mm at the gripper sideways, 1 mm along the shaft."""
 
@@ -48,11 +48,10 @@ class Instrument:
         is to stay the motor does.
         """
         wanted = self.motors(joints, np.zeros(6))
-        return wanted + np.where(
-            wanted == motors - slack, slack, BACKLASH * np.sign(wanted - (motors - slack))
-        )
+        before = motors - slack
+        return wanted + np.where(wanted == before, slack, BACKLASH * np.sign(wanted - before))
 
 
 def slack_after(slack: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """The slack [6] after the motors moved by ``move`` [6] (the play operator): it is taken up, then joints follow."""
+    """Slack [6] after motors moved by ``move`` [6] (play operator): it is taken up, then joints follow."""
     return np.clip(slack + move, -BACKLASH, BACKLASH)

@@ -21,27 +21,16 @@ ACCEPTED = "pin"
 DENSITY = 7800.0  # kg/m³, of steel
 
 PIN_LENGTH, PIN_RADIUS, HEAD_RADIUS = 0.024, 0.0005, 0.0015
-NEEDLE_ARC_RADIUS, NEEDLE_HALF_ANGLE, NEEDLE_RADIUS = (
-    0.009,
-    np.deg2rad(67.5),
-    0.0006,
-)  # three eighths of a circle
+NEEDLE_ARC_RADIUS, NEEDLE_RADIUS = 0.009, 0.0006
+NEEDLE_HALF_ANGLE = np.deg2rad(67.5)  # three eighths of a circle
 NEEDLE_PARTS = 6
 WIRE_LENGTH, WIRE_BEND, WIRE_RADIUS = 0.027, np.deg2rad(40.0), 0.001  # three equal parts, bent to either side
 
-DIODE_LENGTH, DIODE_RADIUS, LEADS_LENGTH, LEAD_RADIUS = (
-    0.005,
-    0.0013,
-    0.026,
-    0.0005,
-)  # as a DO-41, its leads straight
+DIODE_LENGTH, DIODE_RADIUS = 0.005, 0.0013  # as a DO-41, its leads straight
+LEADS_LENGTH, LEAD_RADIUS = 0.026, 0.0005
 NAIL_LENGTH, NAIL_RADIUS, NAIL_HEAD_LENGTH, NAIL_HEAD_RADIUS = 0.030, 0.0010, 0.0012, 0.0024
-SCREW_LENGTH, SCREW_RADIUS, SCREW_HEAD_LENGTH, SCREW_HEAD_RADIUS = (
-    0.016,
-    0.0015,
-    0.0022,
-    0.0028,
-)  # M3 with its head
+SCREW_LENGTH, SCREW_RADIUS = 0.016, 0.0015  # M3 with its head
+SCREW_HEAD_LENGTH, SCREW_HEAD_RADIUS = 0.0022, 0.0028
 THREAD_LENGTH, THREAD_RADIUS, THREAD_LINKS = 0.028, 0.0005, 9
 THREAD_BEND = np.deg2rad(24.0)  # from link to link, as it comes from the spool
 THREAD_STIFFNESS, THREAD_DAMPING, THREAD_ARMATURE = 2e-6, 2e-7, 2e-9  # of a joint: N·m/rad, N·m·s/rad, kg·m²
@@ -82,16 +71,14 @@ def parts(kind: str) -> list[Part]:
 def _turned(edges: Sequence[float], radii: Sequence[float]) -> list[Part]:
     """Cylinders along x, one after another."""
     ends = [np.array([edge, 0.0, 0.0]) for edge in edges]
-    return [
-        Part(*pair, radius, "cylinder") for pair, radius in zip(itertools.pairwise(ends), radii, strict=True)
-    ]
+    pairs = zip(itertools.pairwise(ends), radii, strict=True)
+    return [Part(*pair, radius, "cylinder") for pair, radius in pairs]
 
 
 def _arc() -> np.ndarray:
     angles = np.linspace(-NEEDLE_HALF_ANGLE, NEEDLE_HALF_ANGLE, NEEDLE_PARTS + 1)
-    corners = NEEDLE_ARC_RADIUS * np.stack(
-        [np.sin(angles), 1.0 - np.cos(angles), np.zeros_like(angles)], axis=1
-    )
+    arc = np.stack([np.sin(angles), 1.0 - np.cos(angles), np.zeros_like(angles)], axis=1)
+    corners = NEEDLE_ARC_RADIUS * arc
     return corners - corners.mean(axis=0) * [0.0, 1.0, 0.0]
 
 
@@ -106,15 +93,14 @@ def _loop() -> np.ndarray:
     """A curve that is bent to one side in its first half and to the other one in its second half."""
     links = np.arange(THREAD_LINKS) - THREAD_LINKS // 2
     headings = THREAD_BEND * (np.abs(links) - np.abs(links).mean())
-    steps = (
-        THREAD_LENGTH / THREAD_LINKS * np.stack([np.cos(headings), np.sin(headings), 0.0 * headings], axis=1)
-    )
+    ways = np.stack([np.cos(headings), np.sin(headings), 0.0 * headings], axis=1)
+    steps = THREAD_LENGTH / THREAD_LINKS * ways
     corners = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     return corners - (corners[THREAD_LINKS // 2] + corners[THREAD_LINKS // 2 + 1]) / 2
 
 
 def bodies(kinds: Sequence[str]) -> str:
-    """The XML of free bodies ``object_0``, ``object_1``, ... of these kinds, on the table beside everything else."""
+    """The XML of free bodies ``object_0``, ``object_1``, ... of these kinds, on the table beside all else."""
     return "\n".join(_body(number, kind) for number, kind in enumerate(kinds))
 
 
@@ -136,8 +122,8 @@ def _body(number: int, kind: str) -> str:
 def _geom(part: Part) -> str:
     contact = 'contype="1" conaffinity="1" condim="3" friction=".4 .0005 .0001" solref=".004 1"'
     return (
-        f'<geom type="{part.shape}" fromto="{_numbers(part.start)} {_numbers(part.end)}" size="{part.radius:g}" '
-        f'{contact} material="object" density="{DENSITY:g}" group="1"/>'
+        f'<geom type="{part.shape}" fromto="{_numbers(part.start)} {_numbers(part.end)}" '
+        f'size="{part.radius:g}" {contact} material="object" density="{DENSITY:g}" group="1"/>'
     )
 
 
@@ -150,7 +136,7 @@ def _linked(chain: Sequence[Part]) -> str:
 
 
 def _arm(links: Sequence[tuple[np.ndarray, Part]], origin: np.ndarray) -> str:
-    """Links, each with the point where its joint is, as nested bodies in a body whose frame is at ``origin``."""
+    """Links, each with the point where its joint is, as nested bodies in one with its frame at ``origin``."""
     if not links:
         return ""
     (joint, part), *rest = links

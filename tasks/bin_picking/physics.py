@@ -47,9 +47,8 @@ class Physics(ArmPhysics):
     @property
     def objects(self) -> int:
         """How many objects there are, in the bin or out of it."""
-        return sum(
-            1 for name in range(self.model.nbody) if self.model.id2name(name, "body").startswith("object_")
-        )
+        names = (self.model.id2name(number, "body") for number in range(self.model.nbody))
+        return sum(name.startswith("object_") for name in names)
 
     def place_arm(self, joints: np.ndarray, jaw: float) -> None:
         """Put the arm at true joints [6] and the jaws at an angle (rad), at rest."""
@@ -99,7 +98,7 @@ class Physics(ArmPhysics):
         self.aim(goal, jaw)
 
     def advance(self, steps: int) -> None:
-        """Simulate time steps; where the simulation breaks down it stays where it was, and is ``unstable``."""
+        """Simulate time steps; where the simulation breaks down it stays where it was, ``unstable``."""
         if self.unstable:
             return
         before = self.get_state(), self.time()
@@ -123,7 +122,7 @@ class Physics(ArmPhysics):
         return np.array([self.named.data.subtree_com[name] for name in names]).reshape(-1, 3)
 
     def held(self) -> frozenset[int]:
-        """The objects that the jaws have lifted: those of which nothing but other held objects and the jaws hold up."""
+        """The objects that the jaws have lifted: those that only other held objects and the jaws hold up."""
         centres = self.centres()
         near = np.linalg.norm(centres - self.gripper().position, axis=1) < HELD_REACH
         return frozenset(np.flatnonzero(near & (centres[:, 2] > HELD_HEIGHT)).tolist())

@@ -1,4 +1,4 @@
-"""What the left eye sees of a load where loads are shown, in numbers: the usual descriptors of a mask's shape."""
+"""What the left eye sees of a load where loads are shown, in numbers: usual descriptors of a mask's shape."""
 
 from __future__ import annotations
 
@@ -7,25 +7,21 @@ import numpy as np
 
 from .geometry import SHOWING, project
 
-HALF_HEIGHT, HALF_WIDTH = (
-    52,
-    112,
-)  # pixels about the place where loads are shown; the rows begin at the picture's edge
+# pixels about the place where loads are shown; the rows begin at the picture's edge
+HALF_HEIGHT, HALF_WIDTH = 52, 112
 COLUMN, ROW = np.round(project(SHOWING)).astype(int)
-REGION = (
-    slice(max(0, ROW - HALF_HEIGHT), ROW + HALF_HEIGHT),
-    slice(COLUMN - HALF_WIDTH, COLUMN + HALF_WIDTH),
-)
+ROWS = slice(max(0, ROW - HALF_HEIGHT), ROW + HALF_HEIGHT)
+REGION = (ROWS, slice(COLUMN - HALF_WIDTH, COLUMN + HALF_WIDTH))
 FEWEST = 4  # pixels; fewer have no shape
 NAMES = (
-    "area", "inside", "parts", "largest part", "spread across", "spread along", "hull", "length", "width", "outline",
-    "solidity", "column", "row", "left", "right", "top", "bottom", "slant",
+    "area", "inside", "parts", "largest part", "spread across", "spread along", "hull", "length", "width",
+    "outline", "solidity", "column", "row", "left", "right", "top", "bottom", "slant",
 )  # fmt: skip
 """Of the numbers of :func:`described`."""
 
 
 def load_of(left: np.ndarray) -> np.ndarray:
-    """The numbers [18] of :func:`described` for what the left eye's mask, uint8 [288, 288], shows of a load."""
+    """Numbers [18] of :func:`described` of what a left eye's mask, uint8 [288, 288], shows of a load."""
     return described(left[REGION])
 
 

@@ -32,7 +32,7 @@ KNOWN = 6  # from this step of a trial on the person has seen what is held
 
 
 class WayPoint(NamedTuple):
-    """A gripper pose, whether the jaws are open there, and by how much (m) it may be missed before it is corrected."""
+    """A gripper pose, whether jaws are open there, and by how much (m) it may be missed uncorrected."""
 
     pose: Pose
     open: bool
@@ -160,11 +160,8 @@ class Supervisor(OpenLoop):
         single one (-1 otherwise), and how many were ``left`` in the bin when the trial began.
         """
         kind = (KINDS + UNSEEN).index(self._kinds[min(self._held)]) if len(self._held) == 1 else -1
-        return super().annotations | {
-            "held": len(self._held),
-            "kind": kind,
-            "left": len(self._task.remaining),
-        }
+        own = {"held": len(self._held), "kind": kind, "left": len(self._task.remaining)}
+        return super().annotations | own
 
     def _rest(self) -> list[WayPoint]:
         if len(self._held) != 1:
@@ -174,9 +171,8 @@ class Supervisor(OpenLoop):
     def _by_hand(self, way_point: WayPoint) -> Pose:
         """The gripper pose that a person achieves who wants another one."""
         height = max(0.0, way_point.pose.position[2] - GRASP_HEIGHT)
-        spread = HAND_POSITION[way_point.tolerance] + HAND_HEIGHT_PART * height * (
-            way_point.tolerance == NEAR
-        )
+        far = HAND_HEIGHT_PART * height * (way_point.tolerance == NEAR)
+        spread = HAND_POSITION[way_point.tolerance] + far
         x, y, z = HAND_TURN * self._hand.standard_normal(3)
         turn = psm.rotation(0, x) @ psm.rotation(1, y) @ psm.rotation(2, z)
         offset = spread * self._hand.standard_normal(3)
@@ -185,6 +181,5 @@ class Supervisor(OpenLoop):
 
 def _differs(pose: Pose, way_point: WayPoint) -> bool:
     turn = np.linalg.norm(psm.rotation_vector(pose.rotation.T @ way_point.pose.rotation))
-    return bool(
-        np.linalg.norm(pose.position - way_point.pose.position) > way_point.tolerance or turn > TURN_TOLERANCE
-    )
+    missed = np.linalg.norm(pose.position - way_point.pose.position)
+    return bool(missed > way_point.tolerance or turn > TURN_TOLERANCE)

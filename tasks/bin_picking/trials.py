@@ -13,7 +13,7 @@ MOST_MISSES = 4  # attempts in a row that bring nothing into a cup
 
 
 def most_attempts(objects: int) -> int:
-    """How many attempts a bin with so many objects is given: every fourth at least has to bring one into a cup."""
+    """How many attempts a bin with so many objects has: every fourth at least has to bring one into a cup."""
     return MOST_MISSES * objects
 
 
@@ -21,9 +21,8 @@ class End(Enum):
     """How a bin ended."""
 
     CLEARED = "cleared"  # all objects are in cups
-    MISSED = (
-        "missed"  # four attempts in a row brought not exactly one object into a cup, or too many were made
-    )
+    # four attempts in a row brought not exactly one object into a cup, or too many were made
+    MISSED = "missed"
     LOST = "lost"  # an object lies outside of bin and cups
     UNSEEN = "unseen"  # objects are left, and none is seen
     FOAM = "foam"  # the jaws were pressed further into the foam than it gives way

@@ -31,9 +31,8 @@ JAW_RANGE = (0.0, 0.6)  # rad, between the jaws
 
 START_CENTRE = np.array([-0.018, 0.004])  # m: mean position of the middle of the needle's arc
 START_SPREAD = np.array([0.012, 0.012])  # m: half widths of the uniform distribution about it
-START_TURN = np.deg2rad(
-    30.0
-)  # half width about the heading that would bring the tip straight into the phantom
+# half width about the heading that would bring the tip straight into the phantom
+START_TURN = np.deg2rad(30.0)
 
 # What differs from episode to episode besides the needle's pose; standard deviations.
 REPEATABILITY = np.array([6e-4, 6e-4, 1e-4, 2e-3, 2e-3, 2e-3])  # rad, m: under 0.2 mm at the gripper
@@ -63,9 +62,8 @@ class NeedleInsertion(base.Task):
         """Set points [7] for what the encoders read: six joints (rad, insertion in m), jaw (rad)."""
         del physics
         limits = np.vstack([psm.JOINT_RANGES, JAW_RANGE])
-        return specs.BoundedArray(
-            (7,), float, limits[:, 0], limits[:, 1], name=",".join((*psm.JOINTS, "jaw"))
-        )
+        name = ",".join((*psm.JOINTS, "jaw"))
+        return specs.BoundedArray((7,), float, limits[:, 0], limits[:, 1], name=name)
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Send the arm to where the encoders will read ``action`` [7], within the joints' limits."""
@@ -88,9 +86,8 @@ class NeedleInsertion(base.Task):
         if seen is not None:
             self._ellipse = seen
         observation = OrderedDict()
-        observation["gripper_pose"] = np.concatenate(
-            [reported.position * 1e3, psm.rotation_vector(reported.rotation)]
-        )
+        pose = [reported.position * 1e3, psm.rotation_vector(reported.rotation)]
+        observation["gripper_pose"] = np.concatenate(pose)
         observation["jaw"] = np.array([physics.jaw()])
         observation["needle_ellipse"] = self._ellipse.copy()
         return observation
@@ -148,6 +145,7 @@ def load(seed: int) -> Environment:
     return Environment(physics, NeedleInsertion(random=seed), n_sub_steps=sub_steps)
 
 
+SHARED = [HERE.parent / name for name in SHARED_SOURCES]
 task = Task(
     name="needle",
     load=load,
@@ -156,9 +154,5 @@ task = Task(
     frame=frame,
     steps=STEPS,
     measures={"grasped": "rate", "inserted": "rate", "success": "rate", "accuracy_mm": "mean"},
-    sources=(
-        HERE / "needle.xml",
-        *sorted(HERE.glob("*.py")),
-        *(HERE.parent / name for name in SHARED_SOURCES),
-    ),
+    sources=(HERE / "needle.xml", *sorted(HERE.glob("*.py")), *SHARED),
 )

@@ -14,9 +14,8 @@ from ..vision import principal_angle
 ARC_RADIUS = 0.013  # m
 ARC_HALF_ANGLE = np.pi / 4  # a quarter of a circle
 WIRE_RADIUS = 0.0005  # m
-MIDDLE_HEADING = (
-    -ARC_HALF_ANGLE
-)  # heading of the middle of the arc when the tip points along +x, into the phantom
+# heading of the middle of the arc when the tip points along +x, into the phantom
+MIDDLE_HEADING = -ARC_HALF_ANGLE
 TIP = ARC_RADIUS * np.array([np.sin(ARC_HALF_ANGLE), 1.0 - np.cos(ARC_HALF_ANGLE), 0.0])
 TIP_DIRECTION = np.array([np.cos(ARC_HALF_ANGLE), np.sin(ARC_HALF_ANGLE), 0.0])
 ELLIPSE_CENTRE = np.array([0.0, 0.00226, 0.0])  # of the hull's ellipse, in the needle's frame
@@ -26,7 +25,7 @@ NOMINAL_GRIP = Pose(rotation(2, -np.pi / 2), np.zeros(3))  # the needle in the g
 
 
 def arc_coordinate(point: np.ndarray) -> float:
-    """Position along the wire (m, from the middle towards the tip) nearest to a point [3] of the needle's frame."""
+    """Place along the wire (m, from the middle to the tip) nearest to a point [3] of the needle's frame."""
     angle = np.arctan2(point[0], ARC_RADIUS - point[1])
     return float(ARC_RADIUS * np.clip(angle, -ARC_HALF_ANGLE, ARC_HALF_ANGLE))
 

@@ -61,7 +61,7 @@ class Physics(ArmPhysics):
         super().reset(keyframe_id)
 
     def place(self, joints: np.ndarray, jaw: float, needle: psm.Pose) -> None:
-        """Put the arm at true joints [6] and the jaws at an angle (rad), at rest, and lay the needle at a pose."""
+        """Put the arm at true joints [6] and the jaws at an angle (rad), at rest, and lay down the needle."""
         angle = np.arctan2(needle.rotation[1, 0], needle.rotation[0, 0])
         self.named.data.qpos["needle"] = [*needle.position, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]
         self.place_servos(joints, jaw)
@@ -77,7 +77,7 @@ class Physics(ArmPhysics):
         self.aim(joints, jaw)
 
     def advance(self, steps: int) -> None:
-        """Simulate time steps, and see whether the jaws now hold the needle and whether the phantom lets it in."""
+        """Simulate time steps; see whether jaws now hold the needle and whether the phantom lets it in."""
         super().advance(steps)
         self._try_grip()
         self._try_pierce()
@@ -122,7 +122,7 @@ class Physics(ArmPhysics):
         return forces
 
     def _catch(self) -> np.ndarray:
-        """Where the gripper is on the needle: position along the wire (m), angle from the pads to the wire (rad)."""
+        """Where the gripper is on the needle: place along the wire (m), angle from pads to wire (rad)."""
         grip = self.grip()
         offset = geometry.arc_coordinate(grip.inverse().position)
         wire = grip.rotation @ geometry.arc_tangent(offset)
@@ -133,9 +133,8 @@ class Physics(ArmPhysics):
         closing = 2 * self._to[7] < CLOSED and np.array_equal(self.control(), self._to)
         if closing and not self.held() and np.all(self.pad_forces() > GRIP_FORCE):
             deflected = self._deflected(self.grip())
-            wrist = psm.Pose(
-                np.eye(3), np.array([0.0, 0.0, -psm.JAW_LENGTH])
-            )  # the pads, from the gripper's body
+            # the pads, from the gripper's body
+            wrist = psm.Pose(np.eye(3), np.array([0.0, 0.0, -psm.JAW_LENGTH]))
             self._weld("grip", wrist @ deflected)
             self.named.model.geom_conaffinity[list(PADS)] = 0
             self._to[6:] = self.jaw() / 2  # the servos stall on the needle

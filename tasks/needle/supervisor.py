@@ -50,17 +50,8 @@ HAND_POSITION = 0.0004  # m, in each direction
 HAND_TURN = np.deg2rad(1.5)
 HAND_POSITION_AWAY = 0.12  # more, in m per m that remains to needle or phantom
 HAND_TURN_AWAY = 4.0  # rad per m
-REMAINING = {
-    1: 0.015,
-    2: 0.006,
-    3: 0.0,
-    8: 0.018,
-    9: 0.012,
-    10: 0.010,
-    11: 0.007,
-    12: 0.004,
-    13: 0.0,
-}  # m, by step
+# m, by step
+REMAINING = {1: 0.015, 2: 0.006, 3: 0.0, 8: 0.018, 9: 0.012, 10: 0.010, 11: 0.007, 12: 0.004, 13: 0.0}
 
 CLEARANCE = 0.001  # m, that planned paths keep from mat and phantom
 # The target and the phantom's extent, as the planner knows them (m).
@@ -82,9 +73,8 @@ def make_plan(observation: Observation) -> Plan:
     insertion = geometry.insertion_pose(geometry.NOMINAL_GRIP, TARGET)
     above = [psm.inverse(raised(grasp, height)) for height in APPROACH_HEIGHTS + LIFT_HEIGHTS]
     into = [psm.inverse(shifted(insertion, np.array([standoff, 0.0, 0.0]))) for standoff in STANDOFFS]
-    approach = points_along(
-        plan_path(HOME, above[0], psm.JOINT_RANGES, is_free), np.array([APPROACH_FRACTION])
-    )
+    path = plan_path(HOME, above[0], psm.JOINT_RANGES, is_free)
+    approach = points_along(path, np.array([APPROACH_FRACTION]))
     transfer = points_along(
         plan_path(above[-1], into[0], psm.JOINT_RANGES, is_free_with_needle), np.array(TRANSFER_FRACTIONS)
     )
@@ -130,9 +120,8 @@ def _instrument_points() -> np.ndarray:
 def _needle_points() -> np.ndarray:
     """Points [N, 3] of the needle in the nominal grip, in the gripper's frame."""
     angles = np.linspace(-geometry.ARC_HALF_ANGLE, geometry.ARC_HALF_ANGLE, 9)
-    arc = geometry.ARC_RADIUS * np.stack(
-        [np.sin(angles), 1.0 - np.cos(angles), np.zeros_like(angles)], axis=1
-    )
+    circle = np.stack([np.sin(angles), 1.0 - np.cos(angles), np.zeros_like(angles)], axis=1)
+    arc = geometry.ARC_RADIUS * circle
     return geometry.NOMINAL_GRIP.apply(arc)
 
 

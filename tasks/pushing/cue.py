@@ -42,7 +42,7 @@ class Cued(Pushing):
         self._steps = 0  # observations are described before the first episode
 
     def get_observation(self, physics: Physics) -> OrderedDict[str, np.ndarray]:
-        """That of pushing, where ``goal`` is told at all steps; ``cue`` [1] is ``goal`` while it is shown, then 0."""
+        """That of pushing, where all steps tell ``goal``; ``cue`` [1] is ``goal`` while shown, then 0."""
         observation = super().get_observation(physics)
         observation["cue"] = observation["goal"] if self._steps < CUE else np.zeros(1)
         return observation
@@ -55,7 +55,10 @@ class Cued(Pushing):
         physics.place_goal(self._side * GOAL)
 
     def _decided(self, physics: Physics) -> bool:
-        """Whether goal or box were put somewhere; counts what became of the box. It comes where the arm leaves room."""
+        """Whether goal or box were put somewhere; counts what became of the box.
+
+        The box comes where the arm leaves room.
+        """
         x, _, tilt = physics.box()
         hides = self._steps == CUE
         comes = (
@@ -99,7 +102,7 @@ class Waiting:
 
 
 class Patient(Supervisor):
-    """A supervisor that waits at home for the box. Its label ``side`` is that of the goal, from the first step on."""
+    """A supervisor that waits at home for the box. Its label ``side`` is the goal's, from the first step."""
 
     def __init__(self, decider: Decider, noise: float = 0.0) -> None:
         super().__init__(Waiting(decider), noise)

@@ -94,9 +94,8 @@ class Pushing(base.Task):
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
         """Joint velocities [3] (rad/s); the servos saturate at the limits."""
         del physics
-        return specs.BoundedArray(
-            (3,), float, -geometry.MAX_SPEED, geometry.MAX_SPEED, name="shoulder,elbow,wrist"
-        )
+        name, most = "shoulder,elbow,wrist", geometry.MAX_SPEED
+        return specs.BoundedArray((3,), float, -most, most, name=name)
 
     def before_step(self, action: np.ndarray, physics: Physics) -> None:
         """Send the joint velocities to the servos, which saturate at their limits."""
@@ -112,7 +111,7 @@ class Pushing(base.Task):
         self._reward = float(self.counts.goals - before)
 
     def _decided(self, physics: Physics) -> bool:
-        """Whether something became of the goal; if so, box and goal are put where the next steps need them."""
+        """Whether something became of the goal; if so, box and goal are put where next steps need them."""
         x, _, tilt = physics.box()
         if is_reached(physics):
             self.counts.goals += 1
@@ -261,21 +260,13 @@ def _load(task: Pushing) -> Environment:
     return Environment(Physics.from_xml_path(str(HERE / "pushing.xml")), task, n_sub_steps=SUB_STEPS)
 
 
-MEASURES: dict[str, Kind] = {
-    "success": "rate",
-    "goals": "mean",
-    "topples": "mean",
-    "lost": "mean",
-    "missed": "mean",
-}
+MEASURES: dict[str, Kind] = {"success": "rate", "goals": "mean"}
+MEASURES |= {"topples": "mean", "lost": "mean", "missed": "mean"}
 
 
 def _task(name: str, load: Callable[[int], Environment], steps: int) -> Task:
-    sources = (
-        HERE / "pushing.xml",
-        *sorted(HERE.glob("*.py")),
-        *(HERE.parent / name for name in SHARED_SOURCES),
-    )
+    shared = (HERE.parent / name for name in SHARED_SOURCES)
+    sources = (HERE / "pushing.xml", *sorted(HERE.glob("*.py")), *shared)
     cameras = {"camera": camera(*CAMERA_SIZE)}
     return Task(name, load, supervisor.POLICIES, outcome, frame, sources, steps, MEASURES, cameras)
 

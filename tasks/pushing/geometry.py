@@ -63,18 +63,17 @@ def inverse(tip: np.ndarray, pitch: float) -> np.ndarray:
 
 
 def is_clear(angles: np.ndarray, box_x: float, margin: float) -> bool:
-    """Whether an arm at these angles keeps ``margin`` (m) from an upright box at ``box_x``, and touches no surface."""
+    """Whether an arm at these angles is ``margin`` (m) off an upright box at ``box_x``, and off surfaces."""
     points = joints_positions(angles)
     if min(z for _, z in points[1:]) < RADIUS:
         return False
     half, top = CONTACT + margin, BOX_HEIGHT + RADIUS + margin
-    return not any(
-        _meets((a[0] - box_x, a[1]), (b[0] - box_x, b[1]), half, top) for a, b in itertools.pairwise(points)
-    )
+    moved = [(point[0] - box_x, point[1]) for point in points]
+    return not any(_meets(a, b, half, top) for a, b in itertools.pairwise(moved))
 
 
 def _meets(a: Point, b: Point, half: float, top: float) -> bool:
-    """Whether the segment from a to b meets the rectangle |x| < half, z < top, by clipping it at each side."""
+    """Whether the segment from a to b meets the rectangle |x| < half, z < top, clipped at each side."""
     enter, leave = 0.0, 1.0
     for start, change in ((half - a[0], a[0] - b[0]), (half + a[0], b[0] - a[0]), (top - a[1], a[1] - b[1])):
         if change == 0.0:

@@ -30,9 +30,8 @@ LEVEL, UPRIGHT = (
     0.1,
 )  # m, rad: the same for a path along which all pushes go: a low one kicks the box's foot away
 FARTHEST = 0.55  # m: where such a path begins and ends
-ROOM = np.array(
-    [0.3, 0.3, 0.4]
-)  # rad: how far a push may leave the range of its ends, which keeps the tree small
+# rad: how far a push may leave the range of its ends, which keeps the tree small
+ROOM = np.array([0.3, 0.3, 0.4])
 
 SPACING = 0.02  # rad, between the points of a path
 LOOK_AHEAD = 0.35  # rad along the path: where the arm aims
@@ -98,7 +97,7 @@ class Planner:
             return None
 
     def _approach(self, scene: Scene) -> np.ndarray:
-        """A path round the box to behind it. It begins by backing off, where the arm is too near to the box."""
+        """A path round the box to behind it. It begins by backing off, where the arm is too near to it."""
 
         def is_free(angles: np.ndarray) -> bool:
             return geometry.is_clear(angles, scene.box, MARGIN)
@@ -134,9 +133,8 @@ def push_path(side: int) -> np.ndarray:
 def planned_push(start: np.ndarray, goal: np.ndarray, is_free: IsFree, settings: Settings) -> np.ndarray:
     """A path [N, 3] between joint angles that leaves the range of its ends by a little ``ROOM`` only."""
     ends = np.array([start, goal])
-    ranges = np.stack(
-        [within_limits(ends.min(axis=0) - ROOM), within_limits(ends.max(axis=0) + ROOM)], axis=1
-    )
+    limits = [within_limits(ends.min(axis=0) - ROOM), within_limits(ends.max(axis=0) + ROOM)]
+    ranges = np.stack(limits, axis=1)
     return dense(plan_path(start, goal, ranges, is_free, settings))
 
 
@@ -146,13 +144,13 @@ def within_limits(angles: np.ndarray) -> np.ndarray:
 
 
 def behind(side: int, box: float, distance: float, height: float = 0.0, lean: float = 0.0) -> np.ndarray:
-    """Joint angles with the tip at a distance (m) behind a box's centre; ``height`` and ``lean`` off the usual ones."""
+    """Joint angles with the tip a distance (m) behind a box's centre; ``height``, ``lean`` off the usual."""
     tip = np.array([box - side * distance, rules.PUSH_HEIGHT + height])
     return geometry.inverse(tip, side * rules.PUSH_PITCH + lean)
 
 
 def in_band(angles: np.ndarray, side: int, height: float = BAND, lean: float = LEAN) -> bool:
-    """Whether tip height and pitch are such that the arm may push: within half widths (m, rad) of the usual ones."""
+    """Whether tip height and pitch are such that the arm may push: in half widths (m, rad) of the usual."""
     level = abs(geometry.tip_position(angles)[1] - rules.PUSH_HEIGHT) < height
     return bool(level and abs(float(np.sum(angles)) - side * rules.PUSH_PITCH) < lean)
 

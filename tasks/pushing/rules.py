@@ -41,11 +41,8 @@ class Scene(NamedTuple):
 
 def scene(observation: Observation) -> Scene:
     """The scene of an observation."""
-    return Scene(
-        np.array(observation["joint_angles"], float),
-        float(observation["box_pose"][0]),
-        float(observation["goal"][0]),
-    )
+    box, goal = float(observation["box_pose"][0]), float(observation["goal"][0])
+    return Scene(np.array(observation["joint_angles"], float), box, goal)
 
 
 def advance(scene: Scene) -> float:
@@ -54,6 +51,6 @@ def advance(scene: Scene) -> float:
 
 
 def towards(angles: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Joint velocities [3] (rad/s) from joint angles to others: proportional, all slowed down alike above a limit."""
+    """Joint velocities [3] (rad/s) from joint angles to others: proportional, slowed alike above a limit."""
     velocity = GAIN * (target - angles)
     return velocity * min(1.0, MAX_COMMAND / max(float(np.abs(velocity).max()), 1e-9))

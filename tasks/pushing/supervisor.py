@@ -22,9 +22,8 @@ from .rules import Scene
 
 HAND = 0.2  # rad/s: standard deviation of what a disturbed hand adds to the velocity of each joint
 SHAKIER = (0.3, 0.4)  # rad/s: more of that, for demonstrations that show more ways back
-HAND_MEMORY = (
-    0.8  # of that, from one step to the next: white noise of the same reach would kick the box about
-)
+# of that, from one step to the next: white noise of the same reach would kick the box about
+HAND_MEMORY = 0.8
 
 STEP = rules.FULL_ADVANCE  # how far ahead of itself the tip aims
 OVER = geometry.BOX_HEIGHT + geometry.RADIUS + 0.13  # m: tip height to cross the box
@@ -51,7 +50,7 @@ class Decider(Protocol):
 
 
 class WayPoints:
-    """Goes to way points that are a function of the state alone: up, over the box, down behind it, and push."""
+    """Goes to way points that are a function of the state alone: up, over the box, down behind it, push."""
 
     phase = 0
 
@@ -110,7 +109,10 @@ class Supervisor:
 
     @property
     def annotations(self) -> dict[str, int]:
-        """Of the step just decided: ``side`` (0 left, 1 right), ``phase`` (0 approach, 1 push), and ``skill``: both."""
+        """Of the step just decided: ``side`` (0 left, 1 right) and ``phase`` (0 approach, 1 push).
+
+        ``skill`` is both.
+        """
         side, phase = int(self._side > 0), self._decider.phase
         return {"side": side, "phase": phase, "skill": 2 * side + phase}
 
