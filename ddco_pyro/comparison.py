@@ -1,5 +1,4 @@
-"""Runs compared on the demonstrations that all of them held out, and on rollouts from the same initial
-states.
+"""Runs compared on demonstrations that all of them held out, and on rollouts from the same initial states.
 
 The table follows arviz's ``compare``: rank, total, standard error, difference to the best, its standard
 error. The held-out log-likelihood of a trajectory takes the place of an observation's elpd.
@@ -95,9 +94,7 @@ class Comparison:
             }
             for place, (name, steps) in enumerate(zip(self.trajectories, self.steps, strict=True))
         ]
-        return sorted(
-            listed, key=lambda demonstration: demonstration["log_likelihood_per_step"][self.sorted_by]
-        )
+        return sorted(listed, key=lambda one: one["log_likelihood_per_step"][self.sorted_by])
 
     def as_data(self) -> dict[str, Any]:
         """The comparison as plain data for ``compare.json``."""
@@ -119,16 +116,14 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     (2, 0.0)
 
     :param allow_code: import the user code that the specs name.
-    :raises BadInput: there are fewer than two runs, one is named twice or unfinished, or they held out
-        different data.
+    :raises BadInput: there are fewer than two runs, one is named twice or unfinished, held-out data differ.
     """
     folders = [path_of(run, "runs") for run in runs]
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise BadInput("the same run is given twice; name each once")
     if len(folders) < 2:
-        raise BadInput(
-            "one run alone cannot be compared; name at least two, such as RUN and RUN/baselines/flat"
-        )
+        more = "name at least two, such as RUN and RUN/baselines/flat"
+        raise BadInput(f"one run alone cannot be compared; {more}")
     fits = [load(folder, allow_code) for folder in folders]
     demos = _shared(fits)
     values = [_log_likelihoods(fit, own) for fit, own in zip(fits, demos, strict=True)]
@@ -137,20 +132,12 @@ def compare(runs: Sequence[str | Path], allow_code: bool = False) -> Comparison:
     rows = [_row(rank, fits[run], values[run], best, demos[0].lengths) for rank, run in enumerate(order)]
     ranked = [fits[run] for run in order]
     every = (row for fit in ranked for row in _agreement(fit))
-    agreement = {
-        (row["run"], row["level"], row["labels"]): row for row in every
-    }  # several runs have the same parts
+    # several runs have the same parts
+    agreement = {(row["run"], row["level"], row["labels"]): row for row in every}
     sorted_by = next((fit.place for fit in ranked if fit.spec.hierarchy), ranked[0].place)
     marginal = next((fit.metrics.marginal for fit in ranked if fit.metrics.marginal), None)
-    return Comparison(
-        rows,
-        demos[0].names,
-        demos[0].lengths,
-        [*agreement.values()],
-        _paired_rollouts(ranked),
-        sorted_by,
-        marginal,
-    )
+    names, lengths, pairs = demos[0].names, demos[0].lengths, _paired_rollouts(ranked)
+    return Comparison(rows, names, lengths, [*agreement.values()], pairs, sorted_by, marginal)
 
 
 def _row(rank: int, fit: Fit, values: np.ndarray, best: np.ndarray, lengths: Sequence[int]) -> Row:
@@ -182,9 +169,8 @@ def _shared(fits: Sequence[Fit]) -> list[Demonstrations]:
     shared: list[Demonstrations] = []
     for fit, demos in zip(fits, own, strict=True):
         if demos is None:
-            raise BadInput(
-                f"{fit.place}: held nothing out (demonstrations.valid_fraction: 0); there is nothing to compare"
-            )
+            held = "held nothing out (demonstrations.valid_fraction: 0)"
+            raise BadInput(f"{fit.place}: {held}; there is nothing to compare")
         if shared:
             _check_same(fits[0], shared[0], fit, demos)
             _check_measure(fits[0], fit)
@@ -215,14 +201,14 @@ def _check_measure(first: Fit, second: Fit) -> None:
         dimension = min(ours ^ theirs)
         scored, left = (first, second) if dimension in ours else (second, first)
         raise BadInput(
-            f"{first.place} and {second.place} score different things: control dimension {dimension} is in the "
-            f"likelihood of {scored.place} and not in that of {left.place}; fit both to the same demonstrations, "
-            "with the same version"
+            f"{first.place} and {second.place} score different things: control dimension {dimension} is in "
+            f"the likelihood of {scored.place} and not in that of {left.place}; fit both to the same "
+            "demonstrations, with the same version"
         )
     if different := difference(first.hierarchy.scaling.parts, second.hierarchy.scaling.parts):
         raise BadInput(
-            f"{first.folder} and {second.folder} measure different things: {different}; densities and probabilities "
-            "cannot be ranked, so fit both with the same control.kind"
+            f"{first.folder} and {second.folder} measure different things: {different}; densities and "
+            "probabilities cannot be ranked, so fit both with the same control.kind"
         )
 
 
@@ -239,8 +225,7 @@ def _log_likelihoods(fit: Fit, demos: Demonstrations) -> np.ndarray:
 
 
 def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
-    """For each level of options: the measures that need no matching, and ``accuracy`` with options matched
-    globally.
+    """For each level: the measures that need no matching, and ``accuracy`` with options matched globally.
 
     The same is given for equal parts of each demonstration, as many as options.
     A measure is None where no label is known.
@@ -249,9 +234,8 @@ def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
     if not record or not record.valid or fit.spec.hierarchy is None:
         return
     equal = record.equal_valid or [None] * len(record.valid)
-    for level, labels, *each in zip(
-        fit.spec.hierarchy.levels, record.labels, record.valid, equal, strict=True
-    ):
+    levels = zip(fit.spec.hierarchy.levels, record.labels, record.valid, equal, strict=True)
+    for level, labels, *each in levels:
         for run, scores in zip((fit.place, f"equal lengths, {level.count} parts"), each, strict=True):
             found = {key: scores and getattr(scores, key) for key in UNMATCHED}
             accuracy = scores and scores.matched_globally.accuracy
@@ -259,8 +243,7 @@ def _agreement(fit: Fit) -> Iterator[dict[str, Any]]:
 
 
 def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:
-    """Success of each run against the first one that was rolled out in the task, on the initial states of
-    both.
+    """Success of each run against the first one rolled out in the task, on the initial states of both.
 
     ``p_value`` is McNemar's exact one.
     """
@@ -273,14 +256,13 @@ def _paired_rollouts(fits: Sequence[Fit]) -> list[dict[str, Any]]:
             left, right = [ours[seed] for seed in seeds], [theirs[seed] for seed in seeds]
             rates = {"rate": rate(int(sum(left)), len(left)), "other_rate": rate(int(sum(right)), len(right))}
             each = {name: one.model_dump() for name, one in rates.items()}
-            pairs.append(
-                {"run": first.place, "other": fit.place, **dict(paired_difference(left, right)), **each}
-            )
+            counts = dict(paired_difference(left, right))
+            pairs.append({"run": first.place, "other": fit.place, **counts, **each})
     return pairs
 
 
 def _outcomes(fit: Fit) -> dict[int, float]:
-    """Success (1) or not (0) by the seed of the initial state; a baseline's are in the folder of its run, too."""
+    """Success (1) or not (0) by the seed of the initial state; a baseline's are in its run's folder, too."""
     folder = fit.run_folder.resolve()
     run = folder.parent.parent
     tables = [(folder, fit.name), *([(run, folder.name)] if folder.parent == run / "baselines" else [])]
@@ -310,33 +292,30 @@ def write(compared: Comparison, folder: Path) -> Path:
 def page(compared: Comparison, picture: Drawing, folder: Path) -> Page:
     """A page for ``folder``. Its only links are to segments in a run's report."""
     explained = (
-        f"Held-out log-likelihood of {len(compared.trajectories)} trajectories ({sum(compared.steps)} steps), in nats: "
-        f"{words.NAT}. total: sum over trajectories; se: its standard error. diff: the best's total minus this one's, "
-        "trajectory by trajectory; dse: the standard error of that difference. Errors are over trajectories, for one "
-        "fit of each run. The verdict has the same numbers per step."
+        f"Held-out log-likelihood of {len(compared.trajectories)} trajectories ({sum(compared.steps)} "
+        f"steps), in nats: {words.NAT}. total: sum over trajectories; se: its standard error. diff: the "
+        "best's total minus this one's, trajectory by trajectory; dse: the standard error of that "
+        "difference. Errors are over trajectories, for one fit of each run. The verdict has the same numbers "
+        "per step."
     )
     if not all(row.training.converged for row in compared.rows):
         explained += " Not converged: more epochs may change the rank of such a run."
     likelihood: list[Block] = [run_table(compared), note(explained), picture]
     sections = [Section("likelihood", "Held-out log-likelihood", likelihood)]
     if agreement := agreement_table(compared):
-        sections.append(
-            Section(
-                "agreement", "Agreement with labels", [agreement, note(f"Held-out trajectories. {EXPLAINED}")]
-            )
-        )
+        held_out = note(f"Held-out trajectories. {EXPLAINED}")
+        sections.append(Section("agreement", "Agreement with labels", [agreement, held_out]))
     links = _links(compared, folder)
     listed = (
-        "All of them were held out by every run. Nats per step, the least likely under "
-        f"{compared.sorted_by} first.{' A name leads to the segments in the report of that run.' if links else ''}"
+        f"All of them were held out by every run. Nats per step, the least likely under {compared.sorted_by} "
+        f"first.{' A name leads to the segments in the report of that run.' if links else ''}"
     )
     blocks = [note(listed), *demonstration_table(compared, links).folded(SHOWN, "demonstrations")]
     sections.append(Section("demonstrations", "Every held-out demonstration", blocks))
     if rollouts := rollout_table(compared):
         title = "Success in rollouts from the same initial states"
-        sections.append(
-            Section("rollouts", title, [rollouts, note(f"Rates: Wilson 95 % intervals. {words.P_VALUE}")])
-        )
+        rates = note(f"Rates: Wilson 95 % intervals. {words.P_VALUE}")
+        sections.append(Section("rollouts", title, [rollouts, rates]))
     return Page(f"Comparison of {len(compared.rows)} runs", [Text(verdict(compared), "verdict")], sections)
 
 
@@ -380,12 +359,8 @@ def rollout_table(compared: Comparison) -> Table | None:
     """A row for each pair of runs that were rolled out; None where there is none."""
     rows = []
     for pair in compared.rollouts:
-        runs = [
-            pair["run"],
-            words.rate(Rate(**pair["rate"])),
-            pair["other"],
-            words.rate(Rate(**pair["other_rate"])),
-        ]
+        ours, theirs = (words.rate(Rate(**pair[key])) for key in ("rate", "other_rate"))
+        runs = [pair["run"], ours, pair["other"], theirs]
         counts = [str(pair["only_ours"]), str(pair["only_theirs"]), str(pair["trials"])]
         rows.append([*runs, *counts, words.p_value(pair["p_value"])])
     head = ["run", "succeeds", "other", "succeeds", "only run", "only other", "states", "p"]
@@ -397,9 +372,8 @@ def verdict(compared: Comparison) -> str:
     best, *others = compared.rows
     steps = np.array(compared.steps, dtype=float)
     each = {row.name: np.array(row.each) for row in compared.rows}
-    train, kinds = (
-        {row.name: getattr(row, key) for row in compared.rows} for key in ("in_training", "model")
-    )
+    train = {row.name: row.in_training for row in compared.rows}
+    kinds = {row.name: row.model for row in compared.rows}
     models = verdicts.Models(each, train, steps, kinds, compared.marginal)
     told = [" ".join(doubt) for name in each for doubt in models.doubts(name)]
     leads = {row.name: models.lead(best.name, row.name) for row in others}
@@ -414,7 +388,7 @@ def verdict(compared: Comparison) -> str:
 
 
 def _links(compared: Comparison, folder: Path) -> dict[str, str]:
-    """Addresses of the demonstrations' segments in the report of the run that sorts them, relative to ``folder``."""
+    """Addresses of demonstrations' segments in the report of the run that sorts them, from ``folder`` on."""
     report = Path(compared.sorted_by) / "report.html"
     text = report.read_text(encoding="utf-8") if report.exists() else ""
     address = quote(Path(os.path.relpath(report, folder)).as_posix())
@@ -423,7 +397,7 @@ def _links(compared: Comparison, folder: Path) -> dict[str, str]:
 
 
 def drawn(compared: Comparison, path: Path) -> Drawing:
-    """Totals and paired differences to the best with their errors, as a figure of the page and a file of its own."""
+    """Totals and paired differences to the best with errors: a figure of the page and a file of its own."""
     rows = compared.rows
     totals = [Interval.around(row.total, row.se) for row in rows]
     differences = [Interval.around(-row.difference, row.dse) if row.rank else None for row in rows]
@@ -433,7 +407,7 @@ def drawn(compared: Comparison, path: Path) -> Drawing:
     ]
     alt = "; ".join(f"{row.name}: {row.total:.1f} nats held out" for row in rows)
     caption = (
-        f"Left: held-out log-likelihood of {len(compared.trajectories)} trajectories, ± one standard error. Right: "
-        "each run's minus the best's, ± one standard error of the paired difference."
+        f"Left: held-out log-likelihood of {len(compared.trajectories)} trajectories, ± one standard error. "
+        "Right: each run's minus the best's, ± one standard error of the paired difference."
     )
     return save(interval_plot([row.name for row in rows], panels, alt), path, caption)

@@ -78,8 +78,8 @@ class Backbone:
         try:
             self._call: Any = _pretrained(rest) if module == TIMM else resolve_name(name)
         except Exception as error:  # whatever the network's code raises
-            timm = "; check the name, the connection, and: pip install 'ddco-pyro[timm]' (torchvision has to fit torch)"
-            remedy = timm if module == TIMM else ""
+            install = "pip install 'ddco-pyro[timm]' (torchvision has to fit torch)"
+            remedy = f"; check the name, the connection, and: {install}" if module == TIMM else ""
             raise BadInput(f"encoder {name!r} cannot be loaded: {_message(error)}{remedy}") from error
 
     @property
@@ -93,13 +93,12 @@ class Backbone:
         try:
             values = np.asarray(self._call(pictures))
         except Exception as error:
-            raise BadInput(
-                f"encoder {self.name!r} fails on pictures {[*pictures.shape]}: {_message(error)}"
-            ) from error
+            why = f"fails on pictures {[*pictures.shape]}: {_message(error)}"
+            raise BadInput(f"encoder {self.name!r} {why}") from error
         count = len(pictures)
         if values.dtype.kind != "f" or values.ndim != 2 or len(values) != count or not values.shape[1]:
-            had = f"{values.dtype} {[*values.shape]} for {count} pictures; it has to be floats [{count}, features]"
-            raise BadInput(f"encoder {self.name!r} gives {had}")
+            had = f"{values.dtype} {[*values.shape]} for {count} pictures"
+            raise BadInput(f"encoder {self.name!r} gives {had}; it has to be floats [{count}, features]")
         values = values.astype(np.float32)
         if not np.isfinite(values).all():
             raise BadInput(f"encoder {self.name!r} gives features that are NaN or infinite in float32")
@@ -244,16 +243,14 @@ def load(path: str | Path, key: str | None = None, allow_code: bool = False) -> 
         known = list(file.get(ENCODERS, ()))
         if key not in known and (key is not None or len(known) != 1):
             there = ", ".join(known) or "none"
-            raise DemonstrationsError(
-                f"there is no encoder of {key or 'one observation alone'}; there is: {there}"
-            )
+            wanted = key or "one observation alone"
+            raise DemonstrationsError(f"there is no encoder of {wanted}; there is: {there}")
         group = file[ENCODERS][key or known[0]]
         try:
             about = About.model_validate_json(group.attrs["about"])
         except ValidationError as error:
-            raise DemonstrationsError(
-                f"{group.name} is damaged ({_message(error)}); encode the file again"
-            ) from error
+            damage = f"{group.name} is damaged ({_message(error)})"
+            raise DemonstrationsError(f"{damage}; encode the file again") from error
         projection = None
         if "components" in group:
             projection = Projection(group["mean"][()], group["components"][()], about.explained)
@@ -273,8 +270,7 @@ def encode(
     on_event: OnEvent = ignore,
     allow_code: bool = False,
 ) -> Encoder:
-    """Write the demonstrations of ``path`` to ``out``, with features in place of pictures, and return the
-    encoder.
+    """Write the demonstrations of ``path`` to ``out``, with features for pictures, and return the encoder.
 
     ``out`` holds the encoder, too. Principal components are those of the training demonstrations:
     ``mask/train``, else all that are not in ``mask/valid``.
@@ -284,10 +280,8 @@ def encode(
     :param size: number of principal components. By default at most :data:`SIZE`, without those that are noise
         (:data:`NOISE`); fewer features are not projected.
     :param name: the new observation's key; ``<observation>_features`` by default.
-    :raises DemonstrationsError: the demonstrations cannot be used, or the observation is missing or no
-        picture.
-    :raises BadInput: ``out`` is there already; the encoder cannot be used, or gives fewer features than
-        ``size``.
+    :raises DemonstrationsError: they cannot be used, or the observation is missing or no picture.
+    :raises BadInput: ``out`` exists; the encoder cannot be used, or gives fewer features than ``size``.
     """
     path, out, key = Path(path), Path(out), name or f"{observation}_features"
     if out.exists():
@@ -342,9 +336,8 @@ def _checked(source: Source, demos: Mapping[str, Demonstration], key: str) -> tu
     if key not in first.observations:
         known = [name for name, array in first.observations.items() if is_picture(array)]
         there = ", ".join(known) or "none"
-        raise DemonstrationsError(
-            f"there is no observation {key!r}{nearest(key, known)}; pictures are: {there}"
-        )
+        lacks = f"there is no observation {key!r}{nearest(key, known)}"
+        raise DemonstrationsError(f"{lacks}; pictures are: {there}")
     for name, demo in demos.items():
         check(demo, first)
         array = demo.observations[key]

@@ -56,9 +56,8 @@ def needing(extra: str, what: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise BadInput(
-            f"{what} needs {error.name}; install it with: pip install 'ddco-pyro[{extra}]'"
-        ) from None
+        install = f"install it with: pip install 'ddco-pyro[{extra}]'"
+        raise BadInput(f"{what} needs {error.name}; {install}") from None
 
 
 def refuse_unknown(

@@ -123,9 +123,8 @@ def wandb_offline(folder: Path, spec: Mapping[str, Any]) -> tuple[Add, Callable[
     """A run in ``wandb`` of the run folder, which ``wandb sync`` uploads; nothing is sent before."""
     import wandb
 
-    run: Any = wandb.init(
-        project="ddco-pyro", name=folder.name, dir=str(folder), mode="offline", config=dict(spec)
-    )
+    named = {"project": "ddco-pyro", "name": folder.name, "dir": str(folder)}
+    run: Any = wandb.init(**named, mode="offline", config=dict(spec))
     return lambda values, step: run.log({**values, "epoch": step}), run.finish
 
 
@@ -150,14 +149,12 @@ class Log:
         self, name: str, folder: str | Path, spec: Mapping[str, Any], say: Callable[[str], None] = print
     ) -> None:
         if name not in LOGS:
-            raise BadInput(
-                f"--log: there is no log {name!r}{nearest(name, LOGS)}; there is: {', '.join(LOGS)}"
-            )
+            there = ", ".join(LOGS)
+            raise BadInput(f"--log: there is no log {name!r}{nearest(name, LOGS)}; there is: {there}")
         self._make, package = LOGS[name]
         if find_spec(package) is None:
-            raise BadInput(
-                f"--log {name}: needs {package}; install it with: pip install 'ddco-pyro[{package}]'"
-            )
+            install = f"install it with: pip install 'ddco-pyro[{package}]'"
+            raise BadInput(f"--log {name}: needs {package}; {install}")
         self._name, self._of, self._say = name, (Path(folder), spec), say
         self._program: tuple[Add, Callable[[], None]] | None = None
         self._model, self._failed = "", False

@@ -1,4 +1,4 @@
-"""Many calls side by side, in processes that joblib keeps here or in those of a joblib backend such as dask."""
+"""Many calls side by side, in processes that joblib keeps here or in those of its backends, such as dask."""
 
 from __future__ import annotations
 
@@ -23,28 +23,22 @@ Result = TypeVar("Result")
 ALL_CORES = -1
 """The number of ``jobs`` that stands for one for each core."""
 
-for said in (
-    "A worker stopped",
-    r"\d+ tasks which were still being processed",
-    r"\d+ tasks have been successfully",
-):
-    warnings.filterwarnings(
-        "ignore", said, UserWarning
-    )  # of processes that are replaced, and calls that are given up
+# Of processes that are replaced, and calls that are given up.
+_SAID = r"A worker stopped|\d+ tasks which were still being processed|\d+ tasks have been successfully"
+warnings.filterwarnings("ignore", _SAID, UserWarning)
 
 
 def from_outside(doing: str, fewer: str = "--jobs") -> str:
-    """The message for a process that died, which did a part of the work; ``fewer`` sets the number of processes."""
+    """The message for a process that died, which did a part of the work; ``fewer`` sets their number."""
     return (
-        f"a process that {doing} was ended from outside (too little memory?); what is done is kept in its folder: "
-        f"continue with the same command and --out, with fewer {fewer} if memory was short"
+        f"a process that {doing} was ended from outside (too little memory?); what is done is kept in its "
+        f"folder: continue with the same command and --out, with fewer {fewer} if memory was short"
     )
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Processes that do calls: ``jobs`` of them, -1: one for each core of this machine or of joblib's
-    backend.
+    """Processes that do calls: ``jobs`` of them, -1: one for each core of this machine or joblib's backend.
 
     :raises BadInput: ``jobs`` is not a number of processes.
     """
@@ -79,12 +73,10 @@ def run_all(
     calls alone.
 
     :param doing: what a call does, for the error.
-    :param on_event: given to each call. Events of a call in another process are passed on once the call is
-        completed.
+    :param on_event: given to each call. Events of a call in another process are passed on once it is done.
     :param ordered: whether results come in the order of the calls.
     :param beside: whether this process works on something else inside the block.
-    :param waiting: for ordered calls the event with which the wait for a call begins; the event is passed on
-        once.
+    :param waiting: for ordered calls the event with which the wait for a call begins, passed on once.
     :raises Failed: a process died.
     """
     number, announced = workers.number(len(calls) + beside), waiting or {}
@@ -127,8 +119,12 @@ def run_all(
 def without_lost_calls() -> Iterator[None]:
     """Inside, nothing is said of an error in loky's thread, which misses calls that were given up."""
     show = threading.excepthook
-    lost = lambda error: error.exc_type is KeyError and ".loky." in type(error.thread).__module__  # noqa: E731
-    threading.excepthook = lambda error: None if lost(error) else show(error)
+
+    def tell(error: threading.ExceptHookArgs) -> None:
+        if error.exc_type is not KeyError or ".loky." not in type(error.thread).__module__:
+            show(error)
+
+    threading.excepthook = tell
     try:
         yield
     finally:

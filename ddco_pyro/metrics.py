@@ -1,5 +1,4 @@
-"""The contents of ``metrics.json`` (:class:`Metrics`), how its numbers are shown (:data:`METRICS`), and
-reading files.
+"""The contents of ``metrics.json`` (:class:`Metrics`), how its numbers are shown (:data:`METRICS`), reading.
 
 Log-likelihoods are in nats.
 """
@@ -115,8 +114,7 @@ def write_table(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, 
 
 
 def read_successes(folder: Path) -> dict[tuple[str, int], float]:
-    """Success (1) or failure (0) of a run's rollouts by method and seed; empty without rollouts or without
-    success.
+    """Success (1) or failure (0) of a run's rollouts by method and seed; empty without rollouts or success.
 
     :raises Damaged: ``rollouts.csv`` is damaged.
     """
@@ -133,9 +131,8 @@ def read_successes(folder: Path) -> dict[tuple[str, int], float]:
 
 def refit(folder: Path, remove: str = "it") -> str:
     """The remedy for a damaged file of a run; what the checkpoints hold is not trained again."""
-    return (
-        f"remove {remove} and fit again: {command('fit', folder / 'spec.yaml', '--out', folder, '--resume')}"
-    )
+    again = command("fit", folder / "spec.yaml", "--out", folder, "--resume")
+    return f"remove {remove} and fit again: {again}"
 
 
 class Parts(Record, Generic[T]):
@@ -148,8 +145,7 @@ class Parts(Record, Generic[T]):
 class Marginal(Parts[Finite]):
     """The log-likelihood per step of a density of the control that reads no observation.
 
-    It has the kinds of the model, and is fitted to the training demonstrations. ``controls`` is the number of
-    control dimensions that vary.
+    It has the model's kinds, and is fitted to training demonstrations. ``controls``: dimensions that vary.
     """
 
     controls: AtLeastOne
@@ -211,7 +207,7 @@ class Restarts(Record):
 
 
 class Candidate(Record):
-    """Weights that were tried, and the mean accuracy and edit score of labelled demonstrations that were left out."""
+    """Weights that were tried, and the mean accuracy and edit score of left-out labelled demonstrations."""
 
     power: Finite
     weight: Finite
@@ -226,7 +222,7 @@ class Candidate(Record):
 
 
 class Recogniser(Record):
-    """How much the controls' density (``power``) and the recogniser's evidence (``weight``) count; widths in steps."""
+    """How much the controls' density (``power``) and the recogniser (``weight``) count; widths in steps."""
 
     power: Finite
     weight: Finite
@@ -266,11 +262,9 @@ class Compared(Record):
 
 
 class Below(Record):
-    """By how much training demonstrations are less likely under a hierarchy than under a mixture that it
-    contains.
+    """By how much training demonstrations are less likely under a hierarchy than a mixture that it contains.
 
-    Nats per step: of the ``objective`` of training, and of the log-likelihood. Negative where they are
-    likelier.
+    Nats per step: of training's ``objective``, and of the log-likelihood. Negative where they are likelier.
     """
 
     objective: Finite
@@ -325,7 +319,7 @@ class Seeds(Record):
 
 
 class Dimensions(Record):
-    """Contributions to the log-likelihood per step, by control dimension (None for constant ones) and of options."""
+    """Contributions to the log-likelihood per step: by control dimension (None: constant) and of options."""
 
     by_dimension: list[Finite | None]
     options: Finite
@@ -336,7 +330,7 @@ ByDimension = Parts[Dimensions]
 
 
 class Listed(Record):
-    """A demonstration of a part (``train`` or ``valid``), and its log-likelihood per step under each method."""
+    """A demonstration of a part (``train``, ``valid``), and its log-likelihood per step under each method."""
 
     name: str
     part: str
@@ -345,7 +339,7 @@ class Listed(Record):
 
 
 class BranchUse(Record):
-    """Use of the branches of a level's networks, by option and branch (:mod:`ddco_pyro.evaluation.branch_use`)."""
+    """Use of branches of a level's networks, by option, branch (:mod:`ddco_pyro.evaluation.branch_use`)."""
 
     level: int
     branches: Annotated[list[str], Field(min_length=1)]
@@ -379,8 +373,7 @@ class Use(Record):
 
 
 class Segments(Record):
-    """Segments of a level on the most likely paths: the ``median`` of their steps, and their ``number`` in
-    all.
+    """Segments of a level on the most likely paths: the ``median`` of their steps, and their ``number``.
 
     ``twitches`` of them are too short for a skill (:func:`ddco_pyro.evaluation.options.segments_of`).
     """
@@ -483,8 +476,7 @@ class TrainedLabels(Record):
 class NamedByLabel(Record):
     """An option and the label that it stands for.
 
-    ``agreement`` is the intersection of their steps over the union, in training demonstrations with these
-    labels.
+    ``agreement``: the intersection of their steps over the union, in training demonstrations with the labels.
     """
 
     level: str
@@ -518,7 +510,7 @@ class Scores(Record):
 
 
 class Confusion(Record):
-    """Steps of each label (rows) in each option (columns), and the label that each option is matched with, if any."""
+    """Steps of each label (rows) in each option (columns), and the label matched with each option, if any."""
 
     labels: list[int]
     options: list[int]
@@ -552,14 +544,14 @@ class Agreement(Record):
 
 
 class Engines(Record):
-    """Largest relative differences between the engines before training (:mod:`ddco_pyro.inference.engines`)."""
+    """Largest relative differences between engines before training (:mod:`ddco_pyro.inference.engines`)."""
 
     value: float
     gradient: float
 
 
 class Metrics(Record, frozen=False):
-    """The contents of ``metrics.json``. What does not apply to a run is None or empty, and left out of the file."""
+    """The contents of ``metrics.json``. What does not apply to a run is None or empty, not in the file."""
 
     model: str
     log_likelihood_per_step: Parts[Finite]
@@ -605,9 +597,8 @@ class Metrics(Record, frozen=False):
             lists += [agreement.labels, agreement.train, agreement.valid, agreement.confusion]
         wrong = {len(values) for values in lists if values is not None} - {len(counts)}
         if levels != [list(range(1 + count)) for count in counts] or wrong:
-            raise Damaged(
-                path, f"is not about levels with {', '.join(map(str, counts)) or 'no'} options", remedy
-            )
+            number = ", ".join(map(str, counts)) or "no"
+            raise Damaged(path, f"is not about levels with {number} options", remedy)
         return metrics
 
     def write(self, folder: Path) -> None:

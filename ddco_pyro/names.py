@@ -1,4 +1,4 @@
-"""Names of models, options and labels, and the colours of options: the same in every figure, frame and film."""
+"""Names of models, options and labels, and colours of options: the same in every figure, frame and film."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def choice_names(count: int, named: Sequence[str] = ()) -> tuple[str, ...]:
 CONTROL = "#9a9a9a"
 
 OPTIONS = (
-    "#3f90da", "#e76300", "#332288", "#ecd83c", "#882255", "#7fd8f0", "#5c3317", "#bd1f01", "#a96b59", "#000000",
+    "#3f90da", "#e76300", "#332288", "#ecd83c", "#882255",
+    "#7fd8f0", "#5c3317", "#bd1f01", "#a96b59", "#000000",
 )  # fmt: skip
 """Any two of the first five and the grey of control are more than 23 apart in CIELAB, for normal sight and
 for readers without red, green or blue cones. All ten are more than 18 apart."""

@@ -1,4 +1,4 @@
-"""Confidence intervals of means and rates, paired tests, the edit score of segments, and the worth of a hierarchy."""
+"""Confidence intervals of means and rates, paired tests, the edit score of segments, a hierarchy's worth."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def wider_interval(values: Sequence[float], error: float, trials: int) -> tuple[
 
 
 def mean(values: np.ndarray) -> Mean:
-    """A mean with its standard deviation and Student's 95 % interval; both are None for less than two values."""
+    """A mean with its standard deviation and Student's 95 % interval; both None for less than two values."""
     trials = len(values)
     centre = float(values.mean()) if trials else None
     if trials < 2:
@@ -61,13 +61,12 @@ def rate(successes: int, trials: int) -> Rate:
     from scipy.stats import binomtest
 
     low, high = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return Rate(
-        successes=successes, trials=trials, rate=successes / trials, interval=(float(low), float(high))
-    )
+    interval = (float(low), float(high))
+    return Rate(successes=successes, trials=trials, rate=successes / trials, interval=interval)
 
 
 def paired_difference(ours: Sequence[float], theirs: Sequence[float]) -> Against:
-    """Successes from the same initial states: counts of those of one policy alone, and McNemar's exact p-value."""
+    """Successes from the same initial states: counts of one policy's alone, and McNemar's exact p-value."""
     from scipy.stats import binomtest
 
     only_ours = int(sum(a > b for a, b in zip(ours, theirs, strict=True)))
@@ -96,8 +95,7 @@ def matching(counts: np.ndarray) -> np.ndarray:
 
 
 def edit_score(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """1 − Levenshtein distance of two sequences of segments / the longer one's length, of options [T] at each
-    step.
+    """1 − Levenshtein distance of two sequences of segments / the longer one's length, of options [T].
 
     >>> edit_score(np.array([1, 1, 2, 1]), np.array([1, 2, 2, 2]))
     0.6666666666666667
@@ -116,7 +114,7 @@ def edit_score(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Difference:
-    """Difference in log-likelihood per step between two models on the same demonstrations, with its standard error."""
+    """Difference in log-likelihood per step of two models on the same demonstrations, with standard error."""
     difference = ours - theirs
     mean = float(difference.sum() / lengths.sum())
     residual = difference - mean * lengths  # a ratio of sums: the error of its linearisation
@@ -126,8 +124,7 @@ def paired(ours: np.ndarray, theirs: np.ndarray, lengths: np.ndarray) -> Differe
 
 
 def worth(ours: str, values: Mapping[str, V], difference: Callable[[V, V], T]) -> Worth[T] | None:
-    """The parts of a hierarchy's advantage, as paired differences (:func:`paired`,
-    :func:`paired_difference`).
+    """Parts of a hierarchy's advantage, as paired differences (:func:`paired`, :func:`paired_difference`).
 
     ``memory`` is hierarchy − mixture: both have the same policies and gate, and in the hierarchy alone
     options last. ``experts`` is mixture − flat and ``total`` is hierarchy − flat, where there is a flat

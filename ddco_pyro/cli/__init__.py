@@ -23,7 +23,7 @@ BRACKET = "[" if NARROW else "\\["
 
 @dataclass(frozen=True)
 class Place:
-    """The parser of an option that names a place to write: of a kind of :class:`~ddco_pyro.data.files.Output`."""
+    """The parser of an option that names a place to write, a :class:`~ddco_pyro.data.files.Output`."""
 
     kind: Literal["folder", "file", "stream"]
     __name__ = "path"
@@ -38,13 +38,18 @@ class Place:
         return Path(name)
 
 
+def option(text: str, *names: str, **how: Any) -> Any:
+    """An option and its help; ``names`` where it is not called like the parameter."""
+    return typer.Option(*names, help=text, **how)
+
+
 def written(kind: Literal["folder", "file", "stream"], text: str, **how: Any) -> Any:
     """An option that names a place to write."""
     return typer.Option(help=text, parser=Place(kind), metavar="PATH", **how)
 
 
 def checking(command: Callable[..., None]) -> Callable[..., None]:
-    """A command that first refuses what cannot be written where its options say; other paths are what it reads."""
+    """A command that first refuses what cannot be written where its options say; other paths are read."""
 
     @wraps(command)
     def checked(**given: Any) -> None:
@@ -64,20 +69,18 @@ def checking(command: Callable[..., None]) -> Callable[..., None]:
 
 SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="The spec, a YAML file.")]
 Overrides = Annotated[
-    list[str], typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the spec; repeatable.")
+    list[str], option("Override a key of the spec; repeatable.", "--set", metavar="KEY=VALUE")
 ]
 Wheres = Annotated[
     list[str],
-    typer.Option(
+    option(
+        "Only demonstrations with this value of an attribute, such as task=reach; repeatable.",
         "--where",
         metavar="ATTRIBUTE=VALUE",
-        help="Only demonstrations with this value of an attribute, such as task=reach; repeatable.",
     ),
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished fit.")]
-AllowCode = Annotated[
-    bool, typer.Option("--allow-code", help="Import the user code (module:name) that the spec names.")
-]
+AllowCode = Annotated[bool, option("Import the user code (module:name) that the spec names.", "--allow-code")]
 
 
 def where_of(wheres: Iterable[str]) -> dict[str, list[str]]:

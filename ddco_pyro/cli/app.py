@@ -19,14 +19,15 @@ from typing import Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import NARROW, checking, demos, fits, label, runs, starting
+from ddco_pyro.cli import NARROW, checking, demos, fits, label, option, runs, starting
 from ddco_pyro.errors import BadInput, Failed, reason
 
 app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None if NARROW else "rich",
-    help="Discovers options in demonstrations: a hierarchy of skills, declared in YAML, fitted by exact inference.",
+    help="Discovers options in demonstrations: a hierarchy of skills, declared in YAML, "
+    "fitted by exact inference.",
     epilog="--debug, anywhere on the line, shows the traceback of an error.",
 )
 EXAMPLES: dict[Callable[..., None], str] = {
@@ -59,7 +60,7 @@ def _print_version(asked: bool) -> None:
 @app.callback()
 def top(
     _: Annotated[
-        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
+        bool, option("Print the version.", "--version", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
     """Options that need no command."""

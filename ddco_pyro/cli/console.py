@@ -86,9 +86,8 @@ class Progress:
                 name, _, further = model.partition(" ")
                 self._begin(f"training {method(name)} {further}".rstrip(), epochs)
             case EpochEnded():
-                self._advance(
-                    note=f"{event.stage}: training {event.train:.3f}, tuning {event.tune:.3f} nats/step"
-                )
+                values = f"training {event.train:.3f}, tuning {event.tune:.3f} nats/step"
+                self._advance(note=f"{event.stage}: {values}")
             case RestartStopped(restart, epochs):
                 self._say(f"restart {restart}: stopped at epoch {epochs} (far behind the likeliest)")
             case RestartDiverged(restart, why):
@@ -158,7 +157,7 @@ def show(table: Table) -> None:
 def model(
     spec: Spec, size: Dimensions, hierarchy: Hierarchy, baselines: Sequence[tuple[Spec, Hierarchy]]
 ) -> None:
-    """Shapes, the parameters of each network and baseline, the kinds of the control, and a device that is no CPU."""
+    """Shapes, parameters of each network and baseline, the kinds of the control, a device that is no CPU."""
     from ddco_pyro.training.networks import parameters
     from ddco_pyro.training.processes import described as device_in_words
     from ddco_pyro.training.processes import device_of
@@ -198,9 +197,8 @@ def labels(spec: Spec, used: Labels | None, known: Mapping[str, Sequence[str]]) 
     if used is not None and own is not None:
         names = (label_name(own.source, value, known.get(own.source, ()), own.level) for value in used.values)
         each = ", ".join(f"{name} is {option_name(option)}" for option, name in enumerate(names, start=1))
-        say(
-            f"labels/{own.source}, level {own.level!r}: {each}; used of {len(used.demonstrations)} demonstrations"
-        )
+        used_of = f"used of {len(used.demonstrations)} demonstrations"
+        say(f"labels/{own.source}, level {own.level!r}: {each}; {used_of}")
         from ddco_pyro.evaluation.options import unlabelled_start
 
         for what, advice in unlabelled_start(spec.training):
@@ -232,7 +230,7 @@ def warnings(fit: Fit) -> None:
 
 
 def log_likelihoods(fit: Fit) -> None:
-    """Log-likelihood of the model and of its baselines, the test against the mixture, and what is doubtful of it."""
+    """Log-likelihood of the model and its baselines, the test against the mixture, and what is doubtful."""
     from ddco_pyro.report.likelihood import parts, stds, table
 
     metrics = fit.metrics
@@ -268,7 +266,7 @@ def library(fitted: Fit) -> None:
 
 
 def names(fit: Fit) -> None:
-    """The names in ``names.yaml``, with their agreement with labels, and the line there that takes proposed ones."""
+    """The names in ``names.yaml``, their agreement with labels, and the line that takes proposed ones."""
     found = {(one.level, one.option): one for one in fit.metrics.named_by_labels}
     each = {
         level: [(name, found.get((level, option))) for option, name in enumerate(own[1:], start=1)]
@@ -295,9 +293,8 @@ def names(fit: Fit) -> None:
             say(f"names proposed, not written: {words.listed(said)}; to take them, write into {file}: {line}")
     if found:
         labels = words.listed(dict.fromkeys(f"labels/{one.labels}" for one in found.values()))
-        say(
-            f"Agreement with {labels}: the steps with both an option and its label, divided by the steps with either."
-        )
+        share = "the steps with both an option and its label, divided by the steps with either."
+        say(f"Agreement with {labels}: {share}")
 
 
 def successes(metrics: Metrics) -> None:
@@ -312,7 +309,10 @@ def successes(metrics: Metrics) -> None:
 # --- inspect ------------------------------------------------------------------------------------------------
 
 
-UNKNOWN_FREQUENCY = 'not in the file; with h5py, file.attrs["control_frequency"] = 20 says 20 steps per second, and pages have seconds'
+UNKNOWN_FREQUENCY = (
+    'not in the file; with h5py, file.attrs["control_frequency"] = 20 says 20 steps per second, '
+    "and pages have seconds"
+)
 
 
 def inspection(facts: Inspection) -> None:
@@ -329,18 +329,14 @@ def inspection(facts: Inspection) -> None:
     if facts.several:
         _tasks(facts)
     elif facts.tasks:
-        say(
-            printable(
-                f"tasks: {few([*facts.tasks])}" if len(facts.tasks) < 4 else f"tasks: {len(facts.tasks)}"
-            )
-        )
+        tasks = few([*facts.tasks]) if len(facts.tasks) < 4 else len(facts.tasks)
+        say(printable(f"tasks: {tasks}"))
     rows = [
         [field.place, str(list(field.shape)), str(field.dtype), _range(field), _notes(field)]
         for field in facts.fields.values()
     ]
-    show(
-        Table(["", "a step", "type", "range", "notes"], [list(map(printable, row)) for row in rows], range(5))
-    )
+    printed = [list(map(printable, row)) for row in rows]
+    show(Table(["", "a step", "type", "range", "notes"], printed, range(5)))
     for line in (*facts.notes, *(f"problem: {problem}" for problem in facts.problems)):
         say(printable(line))
 
@@ -359,30 +355,23 @@ def _tasks(facts: Inspection) -> None:
 
 
 def annotators(found: Mapping[str, Annotators], tolerance: int) -> None:
-    """How two annotators agree on each name of labels, and what the second one calls the first one's segments."""
+    """How two annotators agree on each name of labels, and what the second calls the first one's segments."""
     head = ["labels", "demonstrations", "steps", "said by both", "same name", "Cohen's κ", "boundaries"]
     rows = []
     for name, own in found.items():
         middle = float(np.median(own.distances)) if own.distances else None
         same = own.same / own.both if own.both else None
         said = [words.percent(own.both / own.steps), words.percent(same), words.number(own.kappa)]
-        matched = [
-            " and ".join(map(str, own.boundaries)),
-            words.number(own.boundary_f1),
-            words.number(middle, 1),
-        ]
+        boundaries = " and ".join(map(str, own.boundaries))
+        matched = [boundaries, words.number(own.boundary_f1), words.number(middle, 1)]
         rows.append([name, str(own.demonstrations), str(own.steps), *said, *matched])
     show(Table([*head, f"F1 ±{tolerance}", "median distance"], rows))
     for name, own in found.items():
-        rows = [
-            [
-                called,
-                str(sum(counts)),
-                *(words.percent(count / sum(counts)) if count else "" for count in counts),
-            ]
-            for called, counts in zip(own.names, own.counts, strict=True)
-            if any(counts)
-        ]
+        rows = []
+        for called, counts in zip(own.names, own.counts, strict=True):
+            if any(counts):
+                shares = [words.percent(count / sum(counts)) if count else "" for count in counts]
+                rows.append([called, str(sum(counts)), *shares])
         show(Table([name, "steps", *own.names], rows, title="Names of the first file (rows) in the second"))
 
 
@@ -405,9 +394,7 @@ def _notes(field: Field) -> str:
         notes.append("constant up to rounding" if rounding else "constant")
     elif constant + rounding and not field.image:
         listed = {"constant": constant, "constant up to rounding": rounding}
-        notes += [
-            f"{what}: {', '.join(map(str, dimensions))}" for what, dimensions in listed.items() if dimensions
-        ]
+        notes += [f"{what}: {', '.join(map(str, dims))}" for what, dims in listed.items() if dims]
     elif field.still and not field.video:
         notes.append("one value per demonstration")
     return "; ".join(notes)

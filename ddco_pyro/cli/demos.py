@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, where_of, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, option, where_of, written
 from ddco_pyro.data.files import write_text
 from ddco_pyro.data.formats import FORMATS
 from ddco_pyro.errors import BadInput, Failed, command
@@ -23,15 +23,10 @@ if TYPE_CHECKING:
     from ddco_pyro.data.starting import Decided
     from ddco_pyro.data.tasks import Where
 
-SourcePath = Annotated[
-    Path,
-    typer.Argument(
-        metavar="FILE", help=f"Demonstrations: {', '.join(about.text for about in FORMATS.values())}."
-    ),
-]
+_FORMS = ", ".join(about.text for about in FORMATS.values())
+SourcePath = Annotated[Path, typer.Argument(metavar="FILE", help=f"Demonstrations: {_FORMS}.")]
 FormatOption = Annotated[
-    str | None,
-    typer.Option("--format", metavar="NAME", help=f"One of {', '.join(FORMATS)}; recognised unless given."),
+    str | None, option(f"One of {', '.join(FORMATS)}; recognised unless given.", "--format", metavar="NAME")
 ]
 
 
@@ -58,17 +53,14 @@ def collect(
 def inspect(
     file: SourcePath,
     form: FormatOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print all of it as JSON.")] = False,
+    as_json: Annotated[bool, option("Print all of it as JSON.", "--json")] = False,
     against: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Compare labels with those of another annotator instead."),
+        Path | None, option("Compare labels with those of another annotator instead.", metavar="FILE")
     ] = None,
     wheres: Wheres = [],  # noqa: B006
-    tolerance: Annotated[
-        int, typer.Option(min=0, help="Steps between boundaries that match, for --against.")
-    ] = 5,
+    tolerance: Annotated[int, option("Steps between boundaries that match, for --against.", min=0)] = 5,
 ) -> None:
-    """Print the contents of a file: keys, shapes, lengths, ranges, NaN, constant dimensions, masks, a starting spec."""
+    """Print the contents of a file: keys, shapes, lengths, ranges, NaN, constants, masks, a starting spec."""
     if against is not None:
         from ddco_pyro.cli import console
         from ddco_pyro.evaluation.agreement import compare_annotators
@@ -95,9 +87,8 @@ def inspect(
         print(f"\nto fit to it, import it first: {command('import', file, '--out', 'demos.hdf5')}")
         return
     try:
-        print(
-            f"\n{starting_spec(facts, file).text}\nnext: {command('init', file, '--out', f'{file.stem}.yaml')}"
-        )
+        following = command("init", file, "--out", f"{file.stem}.yaml")
+        print(f"\n{starting_spec(facts, file).text}\nnext: {following}")
     except DemonstrationsError as error:
         print(f"\nno spec to start with: {str(error).removeprefix(f'{file}: ')}")
 
@@ -107,23 +98,24 @@ def init(
     out: Annotated[Path, written("stream", "Where to write the spec.")] = Path("spec.yaml"),
     hold_out_by: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "Hold out all demonstrations with some values of an attribute, such as the operator.",
             metavar="ATTRIBUTE",
-            help="Hold out all demonstrations with some values of an attribute, such as the operator.",
         ),
     ] = None,
     segment: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "How long options last, by the median: such as 2s, or 20 for steps. Small fits find the "
+            "settings.",
             metavar="LENGTH",
-            help="How long options last, by the median: such as 2s, or 20 for steps. Small fits find the settings.",
         ),
     ] = None,
     segments: Annotated[
-        int | None, typer.Option(min=1, help="The same by the number of segments in a demonstration.")
+        int | None, option("The same by the number of segments in a demonstration.", min=1)
     ] = None,
     wheres: Wheres = [],  # noqa: B006
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+    force: Annotated[bool, option("Replace a file that is there already.", "--force")] = False,
 ) -> None:
     """Write a commented spec for a file of demonstrations, ready to fit.
 
@@ -164,7 +156,7 @@ def write_spec(
 
 
 def _decided(spec: Spec, facts: Inspection, segment: str | None, segments: int | None) -> Decided | None:
-    """What small fits decide: heavy tails, and what makes options last as long as asked; None where these fail."""
+    """What small fits decide: heavy tails, and what makes options last as asked; None if these fail."""
     from ddco_pyro.cli import console
     from ddco_pyro.selection.small import decide, in_steps
     from ddco_pyro.training.data import demonstrations
@@ -192,55 +184,44 @@ def import_(
     out: Annotated[Path, written("file", "The HDF5 file to write.")],
     form: FormatOption = None,
     observations: Annotated[
-        list[str], typer.Option("--observation", metavar="KEY", help="Import only this one; repeatable.")
+        list[str], option("Import only this one; repeatable.", "--observation", metavar="KEY")
     ] = [],  # noqa: B006 (typer reads the default, which never changes)
     actions: Annotated[
         list[str],
-        typer.Option(
+        option(
+            "The control, where a dataset has several; repeatable, joined in this order.",
             "--action",
             metavar="KEY",
-            help="The control, where a dataset has several; repeatable, joined in this order.",
         ),
     ] = [],  # noqa: B006
-    mask: Annotated[
-        str | None, typer.Option(help="Import only the demonstrations of this mask (filter key).")
-    ] = None,
+    mask: Annotated[str | None, option("Import only the demonstrations of this mask (filter key).")] = None,
     wheres: Wheres = [],  # noqa: B006
-    videos: Annotated[
-        bool, typer.Option("--videos", help="Decode the videos of a LeRobot dataset too.")
-    ] = False,
+    videos: Annotated[bool, option("Decode the videos of a LeRobot dataset too.", "--videos")] = False,
     image_size: Annotated[
-        int | None,
-        typer.Option(min=8, max=4096, help="Scale pictures to so many pixels in height and width."),
+        int | None, option("Scale pictures to so many pixels in height and width.", min=8, max=4096)
     ] = None,
-    hz: Annotated[
-        float | None, typer.Option(min=0.01, help="Steps a second: means over the source's frames.")
-    ] = None,
+    hz: Annotated[float | None, option("Steps a second: means over the source's frames.", min=0.01)] = None,
     labels: Annotated[
         Path | None,
-        typer.Option(
-            metavar="TABLE",
-            help="A table (CSV, TSV, Parquet) of segments that become labels, such as exported by ELAN, BORIS or "
+        option(
+            "A table (CSV, TSV, Parquet) of segments that become labels, such as exported by ELAN, BORIS or "
             "Label Studio.",
+            metavar="TABLE",
         ),
     ] = None,
     columns: Annotated[
         str | None,
-        typer.Option(
-            metavar="ROLE=NAME,...", help="The columns of TABLE: demonstration=A,label=B,start=C,stop=D."
-        ),
+        option("The columns of TABLE: demonstration=A,label=B,start=C,stop=D.", metavar="ROLE=NAME,..."),
     ] = None,
     unit: Annotated[
         Literal["seconds", "milliseconds", "steps"] | None,
-        typer.Option(help="The unit of TABLE's times, unless its columns say it."),
+        option("The unit of TABLE's times, unless its columns say it."),
     ] = None,
     fps: Annotated[
-        float | None,
-        typer.Option(min=0.001, help="Steps per second, for --labels; by default what FILE says."),
+        float | None, option("Steps per second, for --labels; by default what FILE says.", min=0.001)
     ] = None,
     skip_broken: Annotated[
-        bool,
-        typer.Option("--skip-broken", help="Leave out demonstrations that cannot be used, and list them."),
+        bool, option("Leave out demonstrations that cannot be used, and list them.", "--skip-broken")
     ] = False,
 ) -> None:
     """Write demonstrations of another format, or of several files, into this project's layout.
@@ -253,9 +234,8 @@ def import_(
     from ddco_pyro.data.importing import Choice, import_demonstrations
 
     if labels is None and (fps or columns or unit):
-        raise BadInput(
-            "--fps, --columns and --unit are about the table of --labels; give it, or --hz for another rate"
-        )
+        about = "--fps, --columns and --unit are about the table of --labels"
+        raise BadInput(f"{about}; give it, or --hz for another rate")
     size = (image_size, image_size) if image_size else None
     table = LabelTable(labels, _columns(columns), unit, fps) if labels else None
     where = where_of(wheres)
@@ -274,36 +254,28 @@ def _columns(text: str | None) -> dict[str, str]:
     """The columns that ``demonstration=A,label=B,start=C,stop=D``, or a part of it, names."""
     from ddco_pyro.data.annotations import ROLES
 
-    columns = (
-        {role: name for role, _, name in (part.partition("=") for part in text.split(","))} if text else {}
-    )
+    parts = [part.partition("=") for part in text.split(",")] if text else []
+    columns = {role: name for role, _, name in parts}
     if columns.keys() - set(ROLES) or "" in columns.values():
-        raise BadInput(
-            f"--columns {text}: write {','.join(f'{role}=COLUMN' for role in ROLES)}, or a part of it"
-        )
+        wanted = ",".join(f"{role}=COLUMN" for role in ROLES)
+        raise BadInput(f"--columns {text}: write {wanted}, or a part of it")
     return columns
 
 
 def encode(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An HDF5 file of demonstrations.")],
-    observation: Annotated[str, typer.Option(metavar="KEY", help="The pictures to encode.")],
+    observation: Annotated[str, option("The pictures to encode.", metavar="KEY")],
     encoder: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="timm:NAME, such as timm:resnet18.a1_in1k, or your own module:function."
-        ),
+        str, option("timm:NAME, such as timm:resnet18.a1_in1k, or your own module:function.", metavar="NAME")
     ],
     out: Annotated[Path, written("file", "The HDF5 file to write.")],
     size: Annotated[
-        int | None,
-        typer.Option(min=1, help="Principal components to keep; 64 unless there are fewer features."),
+        int | None, option("Principal components to keep; 64 unless there are fewer features.", min=1)
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--as", metavar="NAME", help="The new observation; KEY_features by default.")
+        str | None, option("The new observation; KEY_features by default.", "--as", metavar="NAME")
     ] = None,
-    allow_code: Annotated[
-        bool, typer.Option("--allow-code", help="Import the user code that --encoder names.")
-    ] = False,
+    allow_code: Annotated[bool, option("Import the user code that --encoder names.", "--allow-code")] = False,
 ) -> None:
     """Write demonstrations with a vector of features in place of pictures.
 

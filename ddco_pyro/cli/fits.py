@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, where_of, written
+from ddco_pyro.cli import AllowCode, Overrides, SpecPath, Wheres, option, where_of, written
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.events import Event, Log
 from ddco_pyro.jobs import Workers
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def check(
     spec: Annotated[Path | None, typer.Argument(metavar="[SPEC]", help="The spec, a YAML file.")] = None,
     overrides: Overrides = [],  # noqa: B006 (typer reads the default, which never changes)
-    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of specs instead.")] = False,
+    schema: Annotated[bool, option("Print the JSON Schema of specs instead.", "--schema")] = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Print the spec with all defaults, the shapes it works on, and the parameters of each network."""
@@ -63,31 +63,28 @@ def fit(
     overrides: Overrides = [],  # noqa: B006
     library: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "A run of other tasks, at whose options this one begins; SPEC then says what differs.",
             metavar="RUN",
-            help="A run of other tasks, at whose options this one begins; SPEC then says what differs.",
         ),
     ] = None,
     wheres: Wheres = [],  # noqa: B006
     jobs: Annotated[
         int | None,
-        typer.Option(
-            help="Processes that train restarts, or baselines beside the model; -1, the default, is one for each "
+        option(
+            "Processes that train restarts, or baselines beside the model; -1, the default, is one for each "
             "core, 1 is this process alone."
         ),
     ] = None,
     seeds: Annotated[
-        int | None,
-        typer.Option(min=2, help="Fit with so many training seeds in all, and report their variation."),
+        int | None, option("Fit with so many training seeds in all, and report their variation.", min=2)
     ] = None,
     log: Annotated[
         list[str],
-        typer.Option(
-            "--log", metavar="NAME", help="Log training, too: tensorboard or wandb-offline; repeatable."
-        ),
+        option("Log training, too: tensorboard or wandb-offline; repeatable.", "--log", metavar="NAME"),
     ] = [],  # noqa: B006
     resume: Annotated[
-        bool, typer.Option("--resume", help="Where --out holds this run, finished, show it again.")
+        bool, option("Where --out holds this run, finished, show it again.", "--resume")
     ] = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -147,9 +144,8 @@ def fit_and_report(
     repeated = () if seeds is None else ("--seeds", str(seeds))
     more = [word for name in logs for word in ("--log", name)]
     logged = [Log(name, folder, loaded.model_dump(mode="json"), console.say) for name in logs]
-    again = command(
-        "fit", folder / "spec.yaml", "--out", folder, "--resume", *repeated, *more, *_allowed(loaded)
-    )
+    given = [*repeated, *more, *_allowed(loaded)]
+    again = command("fit", folder / "spec.yaml", "--out", folder, "--resume", *given)
     with _continued(again, folder), console.Progress() as progress, ExitStack() as stack:
         for log in logged:
             stack.enter_context(log)
@@ -187,16 +183,12 @@ def select(
     spec: SpecPath,
     out: Annotated[Path | None, written("folder", "The folder; by default runs/SPEC-select-TIME.")] = None,
     overrides: Overrides = [],  # noqa: B006
-    folds: Annotated[
-        int | None, typer.Option(help="Number of folds; by default the spec's selection.folds.")
-    ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes that train folds; -1 is one for each core.")] = -1,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the unfinished selection in --out.")
-    ] = False,
+    folds: Annotated[int | None, option("Number of folds; by default the spec's selection.folds.")] = None,
+    jobs: Annotated[int, option("Processes that train folds; -1 is one for each core.")] = -1,
+    resume: Annotated[bool, option("Continue the unfinished selection in --out.", "--resume")] = False,
     allow_code: AllowCode = False,
 ) -> None:
-    """Choose among the candidates of the spec's grid by cross-validation; then fit the chosen one to all the data."""
+    """Choose among candidates of the spec's grid by cross-validation; then fit the chosen one to all data."""
     number = [] if folds is None else [f"selection.folds={folds}"]
     loaded, workers = load_spec(spec, [*overrides, *number], allow_code), Workers(jobs)
     folder = out or Path("runs") / f"{spec.stem}-select-{time.strftime('%Y%m%d-%H%M%S')}"

@@ -9,13 +9,13 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import AllowCode, Wheres, demos, where_of
+from ddco_pyro.cli import AllowCode, Wheres, demos, option, where_of
 from ddco_pyro.cli.starting import refuse_other
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput
 from ddco_pyro.spec import load_spec
 
-Level = Annotated[str | None, typer.Option(help="The level that is opened first; by default the lowest.")]
+Level = Annotated[str | None, option("The level that is opened first; by default the lowest.")]
 
 
 def label(
@@ -23,40 +23,34 @@ def label(
         list[Path],
         typer.Argument(
             metavar="[RUN] DEMOS",
-            help="A run with options, and an HDF5 file or a LeRobot dataset. Without a run, one is fitted first.",
+            help="A run with options, and an HDF5 file or a LeRobot dataset. "
+            "Without a run, one is fitted first.",
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="PATH", help="The copy of DEMOS that gets the labels; by default DEMOS_labels, here."
-        ),
+        option("The copy of DEMOS that gets the labels; by default DEMOS_labels, here.", metavar="PATH"),
     ] = None,
-    in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into DEMOS itself.")] = False,
+    in_place: Annotated[bool, option("Write the labels into DEMOS itself.", "--in-place")] = False,
     skills: Annotated[
-        str | None,
-        typer.Option(metavar="NAMES", help="Names of skills, such as reach,grasp,place, or a file of them."),
+        str | None, option("Names of skills, such as reach,grasp,place, or a file of them.", metavar="NAMES")
     ] = None,
     annotator: Annotated[
-        str, typer.Option(metavar="NAME", help="Who labels; each annotator has labels and a journal apart.")
+        str, option("Who labels; each annotator has labels and a journal apart.", metavar="NAME")
     ] = "",
     team: Annotated[
-        str,
-        typer.Option(metavar="NAMES", help="Annotators who share the demonstrations out, such as ann,bob."),
+        str, option("Annotators who share the demonstrations out, such as ann,bob.", metavar="NAMES")
     ] = "",
     twice: Annotated[
-        float, typer.Option(min=0, max=1, help="The share of demonstrations that two annotators label.")
+        float, option("The share of demonstrations that two annotators label.", min=0, max=1)
     ] = 0.0,
     features: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Proposals also read pictures, by a network of encode: timm:NAME."),
+        str | None, option("Proposals also read pictures, by a network of encode: timm:NAME.", metavar="NAME")
     ] = None,
     level: Level = None,
     wheres: Wheres = [],  # noqa: B006
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 is any that is free.")] = 0,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
-    ] = True,
+    port: Annotated[int, option("Port of the page; 0 is any that is free.", min=0, max=65535)] = 0,
+    browser: Annotated[bool, option("Open the page in a browser.", "--browser/--no-browser")] = True,
     allow_code: AllowCode = False,
 ) -> None:
     """Correct segments on a page of this machine; what you say is used for all other demonstrations at once.
@@ -120,8 +114,7 @@ def _names(skills: str | None) -> list[str]:
 
 
 def _fitted(file: Path, count: int = 0, where: Mapping[str, Sequence[str]] = {}) -> Path:
-    """A run fitted to the file, without baselines, left-out demonstrations and report; a finished one is used
-    again.
+    """A run fitted to the file, without baselines, left-out demonstrations and report; reuses a finished one.
 
     Of a dataset of another library, the numbers are imported for it.
 

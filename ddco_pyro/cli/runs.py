@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ddco_pyro.cli import BRACKET, AllowCode, Overrides, RunPath, Wheres, where_of, written
+from ddco_pyro.cli import BRACKET, AllowCode, Overrides, RunPath, Wheres, option, where_of, written
 from ddco_pyro.data.files import Output, check_outputs
 from ddco_pyro.errors import BadInput, refuse_unknown
 from ddco_pyro.segmenting.formats import FORMATS, Asked, check_format, write_format
@@ -24,13 +24,13 @@ FILMED = 3
 
 Best = Annotated[
     bool,
-    typer.Option(
+    option(
+        "Act with the run's baseline that is likelier on held-out demonstrations than its model, by more "
+        "than a standard error, if there is one.",
         "--best",
-        help="Act with the run's baseline that is likelier on held-out demonstrations than its model, by more than a "
-        "standard error, if there is one.",
     ),
 ]
-Jobs = Annotated[int, typer.Option(help="Processes that run episodes; -1 is one for each core.")]
+Jobs = Annotated[int, option("Processes that run episodes; -1 is one for each core.")]
 
 
 def compare(
@@ -42,7 +42,7 @@ def compare(
     ] = None,
     allow_code: AllowCode = False,
 ) -> None:
-    """Compare runs on the demonstrations that all of them held out, and on rollouts from the same initial states."""
+    """Compare runs on demonstrations that all of them held out, and on rollouts from equal initial states."""
     from ddco_pyro import comparison
     from ddco_pyro.cli import console
 
@@ -57,14 +57,12 @@ def compare(
 
 def rollout(
     run: RunPath,
-    episodes: Annotated[
-        int | None, typer.Option(min=1, help="Episodes of each method; by default the spec's.")
-    ] = None,
+    episodes: Annotated[int | None, option("Episodes of each method; by default the spec's.", min=1)] = None,
     best: Best = False,
-    video: Annotated[bool, typer.Option("--video", help="Film the first episodes of each method.")] = False,
+    video: Annotated[bool, option("Film the first episodes of each method.", "--video")] = False,
     jobs: Jobs = -1,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Where RUN holds these rollouts, finished, show them again.")
+        bool, option("Where RUN holds these rollouts, finished, show them again.", "--resume")
     ] = False,
     allow_code: AllowCode = False,
 ) -> None:
@@ -91,7 +89,7 @@ def rollout(
 
 
 def report(run: RunPath, overrides: Overrides = [], allow_code: AllowCode = False) -> None:  # noqa: B006
-    """Write the report of a run again. RUN/spec.yaml keeps what --set changes, such as report.trajectory=KEY."""
+    """Write a run's report again. RUN/spec.yaml keeps what --set changes, such as report.trajectory=KEY."""
     from ddco_pyro.fitting.fitted import load
     from ddco_pyro.fitting.run import claim
     from ddco_pyro.report import write_report
@@ -135,23 +133,19 @@ def segment(
     label_studio: Annotated[Path | None, _to("--label-studio")] = None,
     elan: Annotated[Path | None, _to("--elan")] = None,
     rerun: Annotated[Path | None, _to("--rerun")] = None,
-    in_place: Annotated[
-        bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")
-    ] = False,
+    in_place: Annotated[bool, option("Write the labels into the HDF5 file itself.", "--in-place")] = False,
     same_order: Annotated[
         bool,
-        typer.Option(
+        option(
+            "Leave demonstrations out of --mimicgen and --isaac if their options follow another order than "
+            "most.",
             "--same-order",
-            help="Leave demonstrations out of --mimicgen and --isaac if their options follow another order than most.",
         ),
     ] = False,
-    level: Annotated[
-        str | None, typer.Option(help="The level that gives the subtasks; the lowest by default.")
-    ] = None,
+    level: Annotated[str | None, option("The level that gives the subtasks; the lowest by default.")] = None,
     wheres: Wheres = [],  # noqa: B006
     fps: Annotated[
-        float | None,
-        typer.Option(min=0.001, help="Steps per second; by default the control frequency that DEMOS says."),
+        float | None, option("Steps per second; by default the control frequency that DEMOS says.", min=0.001)
     ] = None,
     allow_code: AllowCode = False,
 ) -> None:
@@ -160,15 +154,11 @@ def segment(
     DEMOS is changed with --in-place only.
     """
     given = locals()
-    named = {option: given[option[2:].replace("-", "_")] for option in FORMATS} | {
-        "--in-place": in_place and demos
-    }
-    places = {option: path for option, path in named.items() if path}
+    named = {form: given[form[2:].replace("-", "_")] for form in FORMATS} | {"--in-place": in_place and demos}
+    places = {form: path for form, path in named.items() if path}
     if not places:
-        raise BadInput(
-            "name what to write, such as --html PAGE or --csv FILE; labels for each step go to --out FILE (a copy) or "
-            "with --in-place into DEMOS"
-        )
+        labels = "labels for each step go to --out FILE (a copy) or with --in-place into DEMOS"
+        raise BadInput(f"name what to write, such as --html PAGE or --csv FILE; {labels}")
     if out and in_place:
         raise BadInput("--out and --in-place exclude each other; keep one")
     if in_place:
@@ -203,7 +193,7 @@ def export(
     ] = None,
     best: Best = False,
     onnx: Annotated[
-        bool, typer.Option("--onnx", help=f"Write ONNX too (pip install 'ddco-pyro{BRACKET}export]').")
+        bool, option(f"Write ONNX too (pip install 'ddco-pyro{BRACKET}export]').", "--onnx")
     ] = False,
     allow_code: AllowCode = False,
 ) -> None:

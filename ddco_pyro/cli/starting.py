@@ -12,15 +12,12 @@ from typing import Annotated
 
 import typer
 
-from ddco_pyro.cli import demos, fits, runs, written
+from ddco_pyro.cli import demos, fits, option, runs, written
 from ddco_pyro.errors import BadInput, Failed, command
 from ddco_pyro.spec import load_spec
 
 Show = Annotated[
-    bool,
-    typer.Option(
-        "--open/--no-open", help="Show the page in a browser, where there is a terminal and a display."
-    ),
+    bool, option("Show the page in a browser, where there is a terminal and a display.", "--open/--no-open")
 ]
 
 

@@ -26,8 +26,9 @@ FAINT = "var(--soft)"
 ACCENT = "#e76300"
 
 LOOKS = (
-    "<style>svg { --ink: #222; --soft: #5c5c5c; --paper: #fff; --line: #ccc; background: #fff; font: 11px sans-serif; "
-    "fill: var(--ink); } .soft { fill: var(--soft); } .faint { fill: none; stroke: var(--line); }</style>"
+    "<style>svg { --ink: #222; --soft: #5c5c5c; --paper: #fff; --line: #ccc; background: #fff; font: 11px "
+    "sans-serif; fill: var(--ink); } .soft { fill: var(--soft); } .faint { fill: none; stroke: var(--line); }"
+    "</style>"
 )
 """Of a drawing that stands alone; a page has these of its own."""
 
@@ -63,9 +64,8 @@ def picture(pixels: np.ndarray, alt: str, caption: str = "") -> Drawing:
 
     :param alt: what is said where it cannot be seen.
     """
-    return Drawing(
-        Markup('<img src="{}" alt="{}">').format(data_uri(jpeg(pixels), "image/jpeg"), alt), caption
-    )
+    image = Markup('<img src="{}" alt="{}">')
+    return Drawing(image.format(data_uri(jpeg(pixels), "image/jpeg"), alt), caption)
 
 
 def film(content: bytes, caption: str) -> Drawing:
@@ -109,13 +109,8 @@ class Interval:
     @property
     def numbers(self) -> list[float]:
         """All numbers that are drawn."""
-        every = [
-            self.value,
-            self.low,
-            self.high,
-            *self.points,
-            *([] if self.hollow is None else [self.hollow]),
-        ]
+        hollow = [] if self.hollow is None else [self.hollow]
+        every = [self.value, self.low, self.high, *self.points, *hollow]
         return [number for number in every if np.isfinite(number)]
 
 
@@ -140,15 +135,14 @@ def interval_plot(
     """A forest plot: a row for each name, panels side by side, and ``notes`` below, a line each."""
     left = min(12 + 6.2 * max(map(len, names)), WIDTH / 2)  # of longer names the ends are seen
     height = TITLE + ROW * len(names) + AXIS
-    parts: list[str] = [
-        words_at(left - 8, TITLE + ROW * (place + 0.65), name, "end") for place, name in enumerate(names)
-    ]
+    parts: list[str] = []
+    for place, name in enumerate(names):
+        parts.append(words_at(left - 8, TITLE + ROW * (place + 0.65), name, "end"))
     for number, panel in enumerate(panels):
         each = (WIDTH - left) / len(panels)
         parts += _panel(panel, left + number * each, each - 14, TITLE + ROW * len(names))
-    parts += [
-        words_at(4, height + 15 * place, text, "start", "soft") for place, text in enumerate(notes, start=1)
-    ]
+    for place, text in enumerate(notes, start=1):
+        parts.append(words_at(4, height + 15 * place, text, "start", "soft"))
     return svg(WIDTH, height + 15 * len(notes) + 4, alt, parts)
 
 
@@ -188,9 +182,8 @@ def _panel(panel: Panel, left: float, width: float, bottom: float) -> list[str]:
         if row and np.isfinite(row.low):
             looks = f'stroke="{row.colour}" stroke-width="1.4"'
             parts += [vertical(at(end), y - 4, y + 4, looks) for end in (row.low, row.high)]
-            parts.append(
-                f'<line x1="{at(row.low):.1f}" y1="{y:.1f}" x2="{at(row.high):.1f}" y2="{y:.1f}" {looks}/>'
-            )
+            ends = f'x1="{at(row.low):.1f}" y1="{y:.1f}" x2="{at(row.high):.1f}" y2="{y:.1f}"'
+            parts.append(f"<line {ends} {looks}/>")
         if row and np.isfinite(row.value):
             parts.append(f'<circle cx="{at(row.value):.1f}" cy="{y:.1f}" r="4" fill="{row.colour}"/>')
     return parts
@@ -220,17 +213,11 @@ def transition_graph(
     at = {choice: (place + 0.5) * gap for place, choice in enumerate(order, start=1)}
     starts, ends = at | {outside: 0.5 * gap}, at | {outside: WIDTH - 0.5 * gap}
     named = [*names, "start"]
-    edges = [
-        (first, second, int(counts[first, second]))
-        for first in starts
-        for second in ends
-        if counts[first, second]
-        >= max(1, RAREST * (counts[outside] if outside in (first, second) else counts).sum())
-    ]
-    up = max((_rise(ends[b] - starts[a], gap) for a, b, _ in edges if ends[b] > starts[a]), default=0.0) + 34
-    down = (
-        max((_rise(starts[a] - ends[b], gap) for a, b, _ in edges if ends[b] < starts[a]), default=0.0) + 58
-    )
+    rarest = {True: max(1, RAREST * counts[outside].sum()), False: max(1, RAREST * counts.sum())}
+    pairs = [(a, b) for a in starts for b in ends if counts[a, b] >= rarest[outside in (a, b)]]
+    edges = [(a, b, int(counts[a, b])) for a, b in pairs]
+    up = max((_rise(ends[b] - starts[a], gap) for a, b in pairs if ends[b] > starts[a]), default=0.0) + 34
+    down = max((_rise(starts[a] - ends[b], gap) for a, b in pairs if ends[b] < starts[a]), default=0.0) + 58
     parts: list[str] = []
     for first, second, count in sorted(edges, key=lambda edge: edge[2]):
         target = "end" if second == outside else named[second]
@@ -241,20 +228,14 @@ def transition_graph(
         radius = 7 + 26 * np.sqrt(shares[choice])
         name = names[choice]
         title = f"{name}: {shares[choice]:.1%} of all steps"
-        parts.append(
-            Markup(
-                '<g><title>{}</title><circle cx="{:.1f}" cy="{:.1f}" r="{:.1f}" fill="{}" stroke="var(--line)"/></g>'
-            ).format(title, x, up, radius, option_colour(choice))
-        )
-        parts.append(
-            words_at(x, up + radius + 14, name if len(name) <= LETTERS else name[: LETTERS - 1] + "…")
-        )
+        circle = '<circle cx="{:.1f}" cy="{:.1f}" r="{:.1f}" fill="{}" stroke="var(--line)"/>'
+        node = Markup("<g><title>{}</title>" + circle + "</g>")
+        parts.append(node.format(title, x, up, radius, option_colour(choice)))
+        short = name if len(name) <= LETTERS else name[: LETTERS - 1] + "…"
+        parts.append(words_at(x, up + radius + 14, short))
     for x, word in ((starts[outside], "start"), (ends[outside], "end")):
-        parts.append(
-            Markup('<circle cx="{:.1f}" cy="{:.1f}" r="5" fill="var(--paper)" stroke="var(--ink)"/>').format(
-                x, up
-            )
-        )
+        node = Markup('<circle cx="{:.1f}" cy="{:.1f}" r="5" fill="var(--paper)" stroke="var(--ink)"/>')
+        parts.append(node.format(x, up))
         parts.append(words_at(x, up + 20, word, kind="soft"))
     return svg(WIDTH, up + down, "Transitions between options", parts)
 
@@ -351,12 +332,10 @@ def paths_of_options(paths: Sequence[np.ndarray], options: Sequence[np.ndarray])
         for place, path in enumerate(placed):
             looks = {"stroke_width": 1.5, "stroke_dasharray": DASHES[LINES[place % len(LINES)]]}
             for start, end in zip(starts, [*starts[1:], len(path) - 1], strict=True):
-                parts.append(
-                    line(path[start : end + 1], stroke=option_colour(int(options[row][start])), **looks)
-                )
-            parts.append(
-                '<circle cx="{:.1f}" cy="{:.1f}" r="3" fill="white" stroke="#222222"/>'.format(*path[0])
-            )
+                colour = option_colour(int(options[row][start]))
+                parts.append(line(path[start : end + 1], stroke=colour, **looks))
+            first = '<circle cx="{:.1f}" cy="{:.1f}" r="3" fill="white" stroke="#222222"/>'
+            parts.append(first.format(*path[0]))
     return svg(WIDTH, WIDTH / 2, "Trajectories coloured by option", parts)
 
 
@@ -376,9 +355,8 @@ def curves(
     for place, (name, each) in enumerate(values.items()):
         low, high = min(array.min() for array in each), max(array.max() for array in each)
         longest = max(max(map(len, each)) - 1, 1)
-        parts.append(
-            f'<g transform="translate({width * (place % columns):.0f},{height * (place // columns):.0f})">'
-        )
+        right, below = width * (place % columns), height * (place // columns)
+        parts.append(f'<g transform="translate({right:.0f},{below:.0f})">')
         parts.append(f'<rect x="2" y="16" width="{width - 8:.0f}" height="{height - 22:.0f}" class="faint"/>')
         parts += [words_at(2, 11, name, "start"), words_at(width - 9, 26, f"{high:.3g}", "end", "soft")]
         parts.append(words_at(width - 9, height - 9, f"{low:.3g}", "end", "soft"))

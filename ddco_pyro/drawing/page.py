@@ -61,9 +61,9 @@ class Table:
     def folded(self, shown: int, what: str) -> list[Block]:
         """The first rows; the others are folded, and ``what`` names them, such as ``demonstrations``."""
         first, rest = (Table(self.head, rows, self.left) for rows in (self.rows[:shown], self.rows[shown:]))
-        return (
-            [first, Card(f"The other {len(rest.rows)} {what}", [rest], folded=True)] if rest.rows else [first]
-        )
+        if not rest.rows:
+            return [first]
+        return [first, Card(f"The other {len(rest.rows)} {what}", [rest], folded=True)]
 
 
 def _line(cells: Sequence[str]) -> str:
@@ -72,7 +72,7 @@ def _line(cells: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph, a small ``note``, a ``verdict`` in larger letters, ``code``, or a ``heading`` inside a section."""
+    """A paragraph, ``note`` (small), ``verdict`` (large), ``code``, or ``heading`` inside a section."""
 
     text: str
     kind: str = "paragraph"
@@ -117,7 +117,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Card:
-    """Blocks side by side under a title, such as all about one option; or ``folded``, shown after a click on it."""
+    """Blocks side by side under a title, such as all about one option; or ``folded``, shown after a click."""
 
     title: str
     blocks: Sequence[Block]
@@ -154,9 +154,8 @@ class Page:
     @property
     def has_timelines(self) -> bool:
         """Whether the page needs the script of time lines."""
-        return any(
-            isinstance(block, Timelines) for section in self.sections if section for block in section.blocks
-        )
+        blocks = chain.from_iterable(section.blocks for section in self.sections if section)
+        return any(isinstance(block, Timelines) for block in blocks)
 
     def html(self) -> str:
         """One self-contained file. Text is escaped unless it is ``markupsafe.Markup``."""
@@ -172,9 +171,7 @@ class Page:
     def markdown(self) -> str:
         """Text and tables in Markdown, beginning with the blocks under the title."""
         parts = [_markdown(self.blocks)]
-        parts += [
-            f"## {section.title}\n\n{_markdown(section.blocks)}" for section in self.sections if section
-        ]
+        parts += [f"## {own.title}\n\n{_markdown(own.blocks)}" for own in self.sections if own]
         return "\n\n".join(filter(None, parts)) + "\n"
 
 
@@ -184,9 +181,6 @@ def _kind(block: Any) -> str:
 
 def _markdown(blocks: Sequence[Block]) -> str:
     flat = chain.from_iterable(block.blocks if isinstance(block, Card) else [block] for block in blocks)
-    shown = (
-        block.text if isinstance(block, Text) else block.markdown()
-        for block in flat
-        if isinstance(block, Table | Text)
-    )
+    told = (block for block in flat if isinstance(block, Table | Text))
+    shown = (block.text if isinstance(block, Text) else block.markdown() for block in told)
     return "\n\n".join(filter(None, shown))

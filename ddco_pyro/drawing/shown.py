@@ -59,9 +59,8 @@ def projection(points: np.ndarray) -> np.ndarray:
     if len(span) == 2:
         return np.array([[1.0, 0.0], [0.0, -1.0]]) / span.max()
     scale = span if span.max() > MOST_STRETCHED * span.min() else np.full(3, span.max())
-    normal = (
-        np.linalg.eigh(np.cov((points / (scale / scale.max())).T))[1][:, 0] if len(points) > 1 else np.ones(3)
-    )
+    scaled = points / (scale / scale.max())
+    normal = np.linalg.eigh(np.cov(scaled.T))[1][:, 0] if len(points) > 1 else np.ones(3)
     normal = -normal if normal[2] < 0 else normal
     up = np.radians(np.clip(np.degrees(np.arcsin(normal[2])), 15, 45))
     quarter, rest = divmod(float(np.degrees(np.arctan2(normal[1], normal[0]))), 90)
@@ -111,9 +110,8 @@ def frames(observed: Observed, steps: Sequence[int] | np.ndarray, height: int) -
     coloured = read[..., :3] if read.shape[-1] >= 3 else np.repeat(read[..., :1], 3, axis=-1)
     width = max(1, round(height * read.shape[2] / read.shape[1]))
     how = cv2.INTER_AREA if height < read.shape[1] else cv2.INTER_NEAREST
-    sized = [
-        cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=how) for picture in coloured
-    ]
+    each = map(np.ascontiguousarray, coloured)
+    sized = [cv2.resize(picture, (width, height), interpolation=how) for picture in each]
     return np.stack(sized)[np.searchsorted(chosen, steps)]
 
 

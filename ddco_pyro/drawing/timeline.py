@@ -101,9 +101,8 @@ def following(
         every = -(-len(values) * steps // MOST_BYTES) or 1
         low = np.array([array.min() for array in values.values()])
         span = np.array([np.ptp(array) for array in values.values()])
-        scaled = [
-            255 * (array - a) / (b or 1) for array, a, b in zip(values.values(), low, span, strict=True)
-        ]
+        each = zip(values.values(), low, span, strict=True)
+        scaled = [255 * (array - a) / (b or 1) for array, a, b in each]
         found: dict[str, Any] = {}
         if values:
             coded = text(np.rint([array[::every] for array in scaled]))
@@ -123,8 +122,7 @@ def following(
 
 
 def _numbers(demo: Demonstration, paths: Sequence[PathSpec]) -> tuple[dict[str, np.ndarray], list[list[int]]]:
-    """Numbers over time by name: those of paths, all controls, then observations; and the places of each
-    path's.
+    """Numbers over time by name: those of paths, all controls, then observations; the places of each path's.
 
     There are :data:`MOST_NUMBERS` in all, or more where paths and controls alone are more.
     """
@@ -132,9 +130,8 @@ def _numbers(demo: Demonstration, paths: Sequence[PathSpec]) -> tuple[dict[str, 
     arrays = {"control": demo.actions.reshape(len(demo), -1), **vectors}
     drawn = [[(path.key, place) for place in path.among(vectors[path.key].shape[1])] for path in paths]
     first = list(dict.fromkeys(chain.from_iterable(drawn)))
-    every = dict.fromkeys(
-        [*first, *((key, place) for key, array in arrays.items() for place in range(array.shape[1]))]
-    )
+    others = ((key, place) for key, array in arrays.items() for place in range(array.shape[1]))
+    every = dict.fromkeys([*first, *others])
     values = {
         f"{key}[{place}]" if arrays[key].shape[1] > 1 else key: arrays[key][:, place].astype(float)
         for key, place in islice(every, max(MOST_NUMBERS, len(first) + arrays["control"].shape[1]))

@@ -54,9 +54,7 @@ def percent(value: float | None, digits: int = 0) -> str:
 
 def interval(value: Sequence[float] | None, scale: float = 1.0, digits: int = 2) -> str:
     """``low to high``."""
-    return (
-        "–" if value is None else f"{number(scale * value[0], digits)} to {number(scale * value[1], digits)}"
-    )
+    return "–" if value is None else " to ".join(number(scale * end, digits) for end in value)
 
 
 def duration(frequency: float | None, *steps: float) -> str:
@@ -77,7 +75,7 @@ def rate(result: Rate, of: str = "") -> str:
 
 
 def measure(name: str) -> str:
-    """A measure as people read it: ``nmi`` is ``NMI``, and a task's own ``accuracy_mm`` is ``Accuracy (mm)``."""
+    """A measure as people read it: ``nmi`` is ``NMI``, a task's own ``accuracy_mm`` is ``Accuracy (mm)``."""
     if name in METRICS:
         return METRICS[name].name
     base, _, unit = name.rpartition("_")
@@ -96,9 +94,8 @@ def over_seeds(name: str, values: Sequence[float]) -> str:
     :param name: of :data:`~ddco_pyro.metrics.METRICS`.
     """
     _, _, scale, digits = METRICS[name]
-    return (
-        f"{signed(scale * float(np.mean(values)), digits)} [{interval(mean_interval(values), scale, digits)}]"
-    )
+    mean = signed(scale * float(np.mean(values)), digits)
+    return f"{mean} [{interval(mean_interval(values), scale, digits)}]"
 
 
 def of_episodes(pair: Against | None) -> str:
@@ -110,11 +107,8 @@ def of_episodes(pair: Against | None) -> str:
 
 def spread(values: Sequence[float]) -> tuple[str, str, str]:
     """Mean, 95 % t interval of the mean, and range of a few values."""
-    return (
-        number(float(np.mean(values))),
-        interval(mean_interval(values)),
-        interval((min(values), max(values))),
-    )
+    mean = number(float(np.mean(values)))
+    return mean, interval(mean_interval(values)), interval((min(values), max(values)))
 
 
 def with_error(difference: Difference | None, digits: int = 2) -> str:

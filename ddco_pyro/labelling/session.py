@@ -768,7 +768,7 @@ class Session:
 
 
 def _band(step: int, drawn: np.ndarray) -> dict[str, Any]:
-    """A boundary with its 90 % interval, and how often draws have each step in it beside the most frequent."""
+    """A boundary with its 90 % interval, and how often draws have its steps, beside the most frequent one."""
     low, high = within(drawn, step)
     often = np.bincount(drawn[(drawn >= low) & (drawn <= high)] - low, minlength=high - low + 1)
     density = text(np.rint(255 * often / max(often.max(), 1)))

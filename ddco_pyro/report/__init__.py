@@ -71,13 +71,11 @@ def write_report(fit: Fit, demos: Demonstrations) -> Path:
 
 
 def segments_of(fit: Fit, demos: Demonstrations) -> Segmented:
-    """The segments of a fit's demonstrations, in the order and with the numbers of ``demonstrations_by_likelihood``."""
-    labels = {
-        demo.name: {name: demo.labels[name] for name in fit.spec.demonstrations.label_names} for demo in demos
-    }
-    found = {
-        demo.name: demo for piece in fit.infer(demos) for demo in of_piece(fit, piece, labels, intervals=True)
-    }
+    """Segments of a fit's demonstrations, ordered and numbered like ``demonstrations_by_likelihood``."""
+    names = fit.spec.demonstrations.label_names
+    labels = {demo.name: {name: demo.labels[name] for name in names} for demo in demos}
+    pieces = (of_piece(fit, piece, labels, intervals=True) for piece in fit.infer(demos))
+    found = {demo.name: demo for piece in pieces for demo in piece}
     rows = fit.metrics.demonstrations_by_likelihood
     held_out = {row.name for row in rows if row.part == "valid"}
     tasks = dict(zip(demos.names, demos.tasks, strict=True))
@@ -95,7 +93,7 @@ def segments_of(fit: Fit, demos: Demonstrations) -> Segmented:
 
 
 def _stored(fit: Fit, demos: Demonstrations) -> list[Observed]:
-    """Pictures of these demonstrations in the fit's file that the fit does not observe; empty where there are none."""
+    """Pictures of these demonstrations in the fit's file that the fit does not observe; empty without any."""
     path = fit.spec.demonstrations.path
     if path is None or not Path(path).is_file():
         return []
@@ -104,7 +102,7 @@ def _stored(fit: Fit, demos: Demonstrations) -> list[Observed]:
 
 
 def header(fit: Fit) -> list[Block]:
-    """The skills' lengths, how they agree with labels, and what is doubtful; of a policy, how likely it is."""
+    """The skills' lengths, agreement with labels, and what is doubtful; of a policy, how likely it is."""
     metrics = fit.metrics
     texts = [verdicts.twitches(metrics.segments, metrics.control_frequency) or verdicts.explained(metrics)]
     texts += [text for text, worse in beside_equal_parts(metrics) if not worse]

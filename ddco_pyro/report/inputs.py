@@ -16,7 +16,7 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.names import name_in_level
 
 GRADIENT_DEMONSTRATIONS, GRADIENT_STEPS = 8, 1000
-"""Demonstrations and steps, padding included, over which gradients with respect to observations are averaged."""
+"""Demonstrations and steps, with padding, over which gradients with respect to observations are averaged."""
 
 
 def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, str]]]:
@@ -65,7 +65,7 @@ def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, s
 def _shares(
     numbers: Tensor, weight: Tensor, vectors: Mapping[str, Tensor], spread: Mapping[str, Tensor]
 ) -> dict[str, float]:
-    """The share of each observation in the size of the gradient of ``numbers`` [N, T, P], weighted by ``weight``."""
+    """Each observation's share in the size of the gradient of ``numbers`` [N, T, P], weighted: ``weight``."""
     sizes = dict.fromkeys(vectors, 0.0)
     for each in numbers.unbind(-1):
         if not each.requires_grad:
@@ -81,12 +81,8 @@ def _shares(
 
 def _largest(values: Mapping[str, float | None], words: Callable[[float | None], str]) -> str:
     """The three largest values in words, without those that round to nothing."""
-    first = [
-        key
-        for key in sorted(values, key=lambda key: -(values[key] or 0.0))[:3]
-        if (values[key] or 0.0) >= 0.005
-    ]
-    return ", ".join(f"{key} {words(values[key])}" for key in first)
+    first = sorted(values, key=lambda key: -(values[key] or 0.0))[:3]
+    return ", ".join(f"{key} {words(values[key])}" for key in first if (values[key] or 0.0) >= 0.005)
 
 
 def branches(fit: Fit) -> Section | None:
@@ -95,18 +91,17 @@ def branches(fit: Fit) -> Section | None:
     for use in fit.metrics.branches:
         for row, losses in enumerate(use.loss):
             inner = use.level < len(levels)
-            name = (
-                name_in_level(1 + row, *levels[use.level]) if inner else "meta-policy" if levels else "policy"
-            )
+            highest = "meta-policy" if levels else "policy"
+            name = name_in_level(1 + row, *levels[use.level]) if inner else highest
             for branch, activation, loss in zip(use.branches, use.activation[row], losses, strict=True):
                 rows.append([name, branch, number(activation, 3), number(loss, 3)])
     if not rows:
         return None
     explained = (
-        "Mean activation: size of a branch's output to the joint layer while the option is active. Nats lost: when the "
-        "branch reads the observation of another step. Held-out demonstrations, or all where none is held out, "
-        "weighted by the posterior of the options. Activations can be compared between the options of a branch, not "
-        "between branches. Nats lost can be compared everywhere."
+        "Mean activation: size of a branch's output to the joint layer while the option is active. Nats "
+        "lost: when the branch reads the observation of another step. Held-out demonstrations, or all where "
+        "none is held out, weighted by the posterior of the options. Activations can be compared between the "
+        "options of a branch, not between branches. Nats lost can be compared everywhere."
     )
     table = Table(["Option", "Branch", "Mean activation", "Nats per step lost"], rows, {0, 1})
     return Section("branches", "Which inputs matter", [table, note(explained)], folded=True)

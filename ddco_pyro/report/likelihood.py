@@ -44,20 +44,17 @@ def section(fit: Fit) -> Section:
             theirs = fit.baselines[name].held_out
             each = [(one.log_likelihood - theirs[one.name]) / one.steps for one in metrics.valid]
             differences.append(Interval.of(other.difference, each))
-        title, axis = (
-            f"{method(metrics.model)} minus each baseline",
-            "nats per step above that method, held out",
-        )
-        panels.append(Panel(title, axis, differences, line=0))
+        title = f"{method(metrics.model)} minus each baseline"
+        panels.append(Panel(title, "nats per step above that method, held out", differences, line=0))
         caption = (
-            "Left: log-likelihood of each method; filled circle: held out, open circle: training. Right: the model’s "
-            "minus each baseline’s on the same held-out demonstrations; circle: mean with one standard error, dots: "
-            "single demonstrations."
+            "Left: log-likelihood of each method; filled circle: held out, open circle: training. Right: the "
+            "model’s minus each baseline’s on the same held-out demonstrations; circle: mean with one "
+            "standard error, dots: single demonstrations."
         )
     units = (
         "Continuous control dimensions have log-densities in the control’s units; switches and bounds have "
-        "log-probabilities. Another unit adds the same constant to every method. So differences in nats can be "
-        "compared; percentages cannot."
+        "log-probabilities. Another unit adds the same constant to every method. So differences in nats can "
+        "be compared; percentages cannot."
     )
     figure = interval_plot(list(map(method, metrics.methods)), panels, alt)
     blocks: list[Block] = [
@@ -112,8 +109,8 @@ def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:
         length = duration(metrics.control_frequency, entry.steps)
         rows.append([name, mark, length, *(number(entry.log_likelihood_per_step[m]) for m in methods)])
     text = (
-        f"Log-likelihood of each demonstration, nats per step. The least likely under {method(metrics.model)} comes "
-        "first: it is unlike the others, or the model fits it poorly."
+        "Log-likelihood of each demonstration, nats per step. The least likely under "
+        f"{method(metrics.model)} comes first: it is unlike the others, or the model fits it poorly."
     )
     found = Table(["Demonstration", "", "Length", *map(method, methods)], rows, {0, 1})
     links = " A name leads to the demonstration’s segments." if anchors else ""
@@ -122,7 +119,7 @@ def demonstrations(metrics: Metrics, anchors: Collection[str]) -> Section:
 
 
 def dimensions(fit: Fit) -> Section:
-    """The contribution of each control dimension, and of choosing options, to the log-likelihood of each method."""
+    """Contributions of each control dimension, and of choosing options, to each method's log-likelihood."""
     metrics = fit.metrics
     methods = {metrics.model: metrics} | {name: other.metrics for name, other in fit.baselines.items()}
     parts = {name: own.log_likelihood_by_dimension for name, own in methods.items()}
@@ -138,11 +135,12 @@ def dimensions(fit: Fit) -> Section:
     rows += [["sum", *map(number, totals), "", ""]]
     head = ["Control dimension", *map(method, values), "Modelled as", "In the demonstrations"]
     explained = (
-        "The log-density of each dimension under the active options, averaged over their posterior. “options”: the "
-        "cost of choosing and ending options, which is minus the divergence of that posterior from the model before it "
-        "sees the controls. The sum is the log-likelihood. The density of a gaussian dimension that often takes one "
-        "exact value grows without bound as σ shrinks; a large number there is no sign of a better model. Clipped and "
-        "binary dimensions have probabilities at such values."
+        "The log-density of each dimension under the active options, averaged over their posterior. "
+        "“options”: the cost of choosing and ending options, which is minus the divergence of that posterior "
+        "from the model before it sees the controls. The sum is the log-likelihood. The density of a "
+        "gaussian dimension that often takes one exact value grows without bound as σ shrinks; a large "
+        "number there is no sign of a better model. Clipped and binary dimensions have probabilities at such "
+        "values."
     )
     shown = "held-out" if held_out else "training"
     text = f"Nats per step on {shown} demonstrations."
@@ -154,15 +152,15 @@ def dimensions(fit: Fit) -> Section:
 
 
 EXPLAINED = (
-    f"A nat is the unit of log-likelihood: {NAT}. A mixture has the options’ policies and the gate that chooses among "
-    "them, and chooses anew at every step. Mixture − flat: what several policies, and their parameters, add to one. "
-    "Options − mixture: what options that last add. This fit: ± one standard error over held-out demonstrations, p by "
-    "McNemar’s exact test. Training seeds: mean with its 95 % interval."
+    f"A nat is the unit of log-likelihood: {NAT}. A mixture has the options’ policies and the gate that "
+    "chooses among them, and chooses anew at every step. Mixture − flat: what several policies, and their "
+    "parameters, add to one. Options − mixture: what options that last add. This fit: ± one standard error "
+    "over held-out demonstrations, p by McNemar’s exact test. Training seeds: mean with its 95 % interval."
 )
 
 
 def test(metrics: Metrics) -> Section | None:
-    """Options against the mixture, or a model against its baselines: a sentence and a table; None without any."""
+    """Options against the mixture, or a model against its baselines: a sentence and a table; else None."""
     if not metrics.comparison:
         return None
     found, blocks = parts(metrics), list[Block]()

@@ -1,4 +1,4 @@
-"""Options in the report: how each is used, where it is active in space, its segments, and agreement with labels."""
+"""Options in the report: use of each, where it is active in space, its segments, agreement with labels."""
 
 from __future__ import annotations
 
@@ -35,22 +35,20 @@ def section(fit: Fit, segmented: Segmented, shown: Shown) -> Section:
     blocks: list[Block] = []
     if len(fit.names) > 1:
         named = " Legends give the names of the highest level first." if fit.named else ""
-        blocks.append(
-            Text(f"Each level numbers its own options: equal colours in two levels mean nothing.{named}")
-        )
+        apart = "Each level numbers its own options: equal colours in two levels mean nothing."
+        blocks.append(Text(apart + named))
     for level in reversed(fit.names) if shown.paths else ():
         options = [demo.levels[level].options for demo in segmented.segments]
         drawing = paths_of_options(shown.paths, options)
         name = "trajectories" if len(fit.names) == 1 else f"trajectories-{level}"
         caption = (
-            f"Level “{level}”: {min(len(options), MOST_PATHS)} demonstrations, coloured by the most likely option: "
-            f"{in_words(shown.drawn, shown.demos)}. Circles: first steps."
+            f"Level “{level}”: {min(len(options), MOST_PATHS)} demonstrations, coloured by the most likely "
+            f"option: {in_words(shown.drawn, shown.demos)}. Circles: first steps."
         )
         blocks.append(save(drawing, fit.run_folder / "figures" / f"{name}.svg", caption))
     blocks += [Text("Use of the options", "heading"), use_table(fit)]
-    blocks.append(
-        note("On the most likely path of all demonstrations. The same option chosen anew stays one segment.")
-    )
+    anew = "The same option chosen anew stays one segment."
+    blocks.append(note(f"On the most likely path of all demonstrations. {anew}"))
     for level in reversed(fit.names):
         blocks += use_by_task(segmented, level)
     link = Markup('<a href="#segments">segments of every demonstration</a>')
@@ -82,9 +80,8 @@ def segments(drawn: Timelines, demonstrations: int) -> Section:
     blocks: list[Block] = [note(explained), replace(drawn, rows=ROWS)]
     if len(drawn.tracks) < demonstrations:
         command = Markup("<code>ddco-pyro segment RUN FILE --html PAGE</code>")
-        blocks.append(
-            note(Markup("The others would make this page slow; {} makes a page of them.").format(command))
-        )
+        others = Markup("The others would make this page slow; {} makes a page of them.")
+        blocks.append(note(others.format(command)))
     return Section("segments", "Segments of every demonstration", blocks)
 
 
@@ -92,7 +89,7 @@ def segments(drawn: Timelines, demonstrations: int) -> Section:
 
 
 def agreement(fit: Fit, demos: Demonstrations) -> Section | None:
-    """The measures of each level, and where the steps of each label lie; None where the spec names no labels."""
+    """The measures of each level, and where the steps of each label lie; None if the spec names no labels."""
     record = fit.metrics.agreement
     names, truth = list(fit.names), fit.spec.demonstrations.labels_by_level(len(fit.names))
     if not record or not truth:
@@ -119,10 +116,8 @@ def agreement(fit: Fit, demos: Demonstrations) -> Section | None:
         blocks.append(Text(f"{capital(told)}."))
     if each := contributions(fit.metrics.training):
         rows = [[name, number(accuracy), number(edit)] for name, (accuracy, edit) in each.items()]
-        blocks += [
-            Text("Left-out labelled demonstrations", "heading"),
-            Table(["", "Accuracy", "Edit score"], rows),
-        ]
+        table = Table(["", "Accuracy", "Edit score"], rows)
+        blocks += [Text("Left-out labelled demonstrations", "heading"), table]
     for level, label, own in zip(names, truth, record.confusion, strict=True):
         names_of_labels = [label_name(label, value, known.get(label, ()), level) for value in own.labels]
         title = f"Where each label’s steps lie: level “{level}”, label “{label}”"
@@ -130,9 +125,9 @@ def agreement(fit: Fit, demos: Demonstrations) -> Section | None:
     part = "training" if record.valid is None else "held-out"
     blocks.append(
         note(
-            f"Share of the steps of each label, {part} demonstrations. “Stands for”: the label matched with the "
-            "option in all demonstrations; – for an option without a label. The steps of a label without an option "
-            "lie in options that stand for other labels."
+            f"Share of the steps of each label, {part} demonstrations. “Stands for”: the label matched with "
+            "the option in all demonstrations; – for an option without a label. The steps of a label without "
+            "an option lie in options that stand for other labels."
         )
     )
     return Section("agreement", "Agreement with ground truth", blocks)

@@ -25,12 +25,11 @@ def success(fit: Fit) -> Section | None:
         return None
     methods = record.methods
     explained = (
-        "Rates: successes of trials (Wilson 95 % interval). Other measures: mean ± standard deviation [95 % interval "
-        "of the mean], n episodes in which the measure is known."
+        "Rates: successes of trials (Wilson 95 % interval). Other measures: mean ± standard deviation [95 % "
+        "interval of the mean], n episodes in which the measure is known."
     )
-    text = (
-        f"{record.episodes} episodes of each method from the same initial states (seeds from {record.seed})."
-    )
+    states = f"the same initial states (seeds from {record.seed})"
+    text = f"{record.episodes} episodes of each method from {states}."
     blocks: list[Block] = [Text(text), measures_table(methods), note(explained)]
     if paired := paired_table(methods, fit.metrics.model):
         blocks += [Text("Paired comparison of success", "heading"), paired, note(P_VALUE)]
@@ -40,9 +39,7 @@ def success(fit: Fit) -> Section | None:
 def measures_table(methods: Mapping[str, Method], title: str | None = None) -> Table:
     """Every measure of every method, as in the paper's table."""
     names = list(dict.fromkeys(name for entry in methods.values() for name in entry.measures))
-    rows = [
-        [method(key), *(_cell(entry.measures.get(name)) for name in names)] for key, entry in methods.items()
-    ]
+    rows = [[method(key), *(_cell(own.measures.get(name)) for name in names)] for key, own in methods.items()]
     return Table(["Method", *map(measure, names)], rows, title=title)
 
 
@@ -64,22 +61,16 @@ def paired_table(methods: Mapping[str, Method], ours: str) -> Table | None:
         for name, results in methods.items()
         if (pair := results.against)
     ]
-    head = [
-        f"{method(ours)} against",
-        f"Only {method(ours)}: success",
-        "Only the other: success",
-        "Episodes",
-        "p",
-    ]
+    successes = [f"Only {method(ours)}: success", "Only the other: success"]
+    head = [f"{method(ours)} against", *successes, "Episodes", "p"]
     return Table(head, rows) if rows else None
 
 
 def films(fit: Fit) -> Section | None:
     """Filmed rollouts, the model's first; None where nothing was filmed."""
     folder = fit.run_folder
-    paths = sorted(
-        (folder / "videos").glob("*.mp4"), key=lambda path: (_named(path)[0] != fit.name, *_named(path))
-    )
+    filmed = (folder / "videos").glob("*.mp4")
+    paths = sorted(filmed, key=lambda path: (_named(path)[0] != fit.name, *_named(path)))
     if not paths:
         return None
     explained = "The border has the colour of the lowest level’s option; h1 is its number."
@@ -88,9 +79,8 @@ def films(fit: Fit) -> Section | None:
 
 def films_of(folder: Path, paths: list[Path]) -> list[Drawing]:
     """The films of a run folder with their outcomes, the first ones held in the page."""
-    outcomes = {
-        key: ": success" if value == 1 else ": failure" for key, value in read_successes(folder).items()
-    }
+    successes = read_successes(folder).items()
+    outcomes = {key: ": success" if value == 1 else ": failure" for key, value in successes}
     left, films = MOST_BYTES, []
     for path in paths:
         name, seed = _named(path)

@@ -1,4 +1,4 @@
-"""Skills in the report: each option with its use, pictures and films of its typical segments, and their order."""
+"""Skills in the report: each option with its use, pictures and films of typical segments, and their order."""
 
 from __future__ import annotations
 
@@ -190,10 +190,8 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
     for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
         if len(fit.names) > 1:
             blocks.append(Text(f"Level “{level}”", "heading"))
-        counts, present = (
-            transitions(segmented, level),
-            {one.choice: one for one in every if one.level == level},
-        )
+        counts = transitions(segmented, level)
+        present = {one.choice: one for one in every if one.level == level}
         for choice, one in present.items():
             low, high = np.percentile([len(each) for each in one.found], [25, 75])
             facts = {
@@ -216,9 +214,8 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
                 facts["Most like"] = near
             if finding := whole.get((1 + place, choice)):
                 facts["No skill"] = finding.deed(segmented.frequency)
-            facts |= {
-                what: values[choice] for what, values in reads.get(level, {}).items() if choice in values
-            }
+            read = reads.get(level, {}).items()
+            facts |= {what: values[choice] for what, values in read if choice in values}
             facts = {what: said.replace(" %", "\N{NO-BREAK SPACE}%") for what, said in facts.items()}
             blocks.append(Card(one.name, [Facts(facts), *shown.blocks(one.found, choice)]))
         onset = {
@@ -227,11 +224,10 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
         }
         order = sorted(present, key=onset.__getitem__)
         caption = (
-            "Order of the options: numbers count transitions between segments; the width of an arc is the share of its "
-            "start's transitions. Arcs above lead to the right, arcs below back. Arcs of less than 1 % of transitions, "
-            "or of starts or ends, are left out. The area of a circle is the share of steps. From left to right, by "
-            "mean onset: "
-            f"{', '.join(names[choice] for choice in order)}."
+            "Order of the options: numbers count transitions between segments; the width of an arc is the "
+            "share of its start's transitions. Arcs above lead to the right, arcs below back. Arcs of less "
+            "than 1 % of transitions, or of starts or ends, are left out. The area of a circle is the share "
+            f"of steps. From left to right, by mean onset: {', '.join(names[choice] for choice in order)}."
         )
         shares = [present[choice].share if choice in present else 0.0 for choice in range(len(names))]
         blocks.append(Drawing(transition_graph(counts, shares, names, order), caption))
@@ -239,12 +235,9 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
 
 
 def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
-    """The option from which an option's policy differs least, in words; empty for the only one, and for control."""
-    known = [
-        (one.divergence, *one.options)
-        for one in pairs
-        if choice in one.options and one.divergence is not None
-    ]
+    """The option from which an option's policy differs least, in words; empty for the only one, control."""
+    own = [one for one in pairs if choice in one.options]
+    known = [(one.divergence, *one.options) for one in own if one.divergence is not None]
     if not known:
         return ""
     apart, first, second = min(known)
@@ -253,15 +246,12 @@ def _nearest(choice: int, pairs: Sequence[Alike], names: Sequence[str]) -> str:
 
 def _frequent(counts: np.ndarray, names: Sequence[str]) -> str:
     """The two most frequent ones with their shares."""
-    first = np.argsort(-counts, kind="stable")[:2]
-    return ", ".join(
-        f"{names[place]} {percent(counts[place] / counts.sum())}" for place in first if counts[place]
-    )
+    first, total = np.argsort(-counts, kind="stable")[:2], counts.sum()
+    return ", ".join(f"{names[place]} {percent(counts[place] / total)}" for place in first if counts[place])
 
 
 class Shown:
-    """Pictures and films of segments, from what demonstrations have: pictures, or else paths, or else
-    controls.
+    """Pictures and films of segments, from what demonstrations have: pictures, else paths, else controls.
 
     :param demos: in the order of their segments.
     :param pictures: of each demonstration; empty for none.
@@ -282,16 +272,17 @@ class Shown:
 
     def explained(self) -> str:
         """What the drawings of each option are."""
-        typical = "Typical segments have the largest mean posterior probability; different demonstrations come first."
+        typical = "Typical segments have the largest mean posterior probability; "
+        typical += "different demonstrations come first."
         if self.pictures:
             return (
-                f"Contact sheet: first, middle and last picture of a segment, a row each. {typical} Instances in a "
-                "film are aligned at their onset; one that has ended rests."
+                f"Contact sheet: first, middle and last picture of a segment, a row each. {typical} "
+                "Instances in a film are aligned at their onset; one that has ended rests."
             )
         if not self.drawn:
             return (
-                f"Lines: controls from the onset of each segment on. {typical} To draw an observation as a path in "
-                "space: ddco-pyro report RUN --set report.trajectory=KEY."
+                f"Lines: controls from the onset of each segment on. {typical} To draw an observation as a "
+                "path in space: ddco-pyro report RUN --set report.trajectory=KEY."
             )
         return (
             f"Drawings: {in_words(self.drawn, self.demos)}. Circle, square and triangle: first, "
@@ -326,31 +317,28 @@ class Shown:
         if self.drawn:
             rows = list(dict.fromkeys([*(one.row for one in chosen), *range(len(self.demos))]))[:MOST_PATHS]
             segments = [(rows.index(one.row), one.start, one.end) for one in chosen]
-            return Drawing(
-                typical_paths([self.paths[row] for row in rows], segments, option_colour(choice)), caption
-            )
+            paths = [self.paths[row] for row in rows]
+            return Drawing(typical_paths(paths, segments, option_colour(choice)), caption)
         every = [
             self.demos[one.row].actions.reshape(len(self.demos[one.row]), -1)[one.start : one.end, :controls]
             for one in chosen[:INSTANCES]
         ]
-        values = {
-            f"control[{n}]": [array[:, n].astype(float) for array in every] for n in range(every[0].shape[1])
-        }
+        numbers = range(every[0].shape[1])
+        values = {f"control[{n}]": [array[:, n].astype(float) for array in every] for n in numbers}
         return Drawing(curves(values, [{"stroke": option_colour(choice)}]), caption)
 
 
 def sheet_of(pictures: Sequence[Observed], chosen: Sequence[Instance], where: str) -> Drawing:
     """First, middle and last picture of each instance, a row each."""
     steps = [(one.start, (one.start + one.end - 1) // 2, one.end - 1) for one in chosen]
-    strips = [
-        frames(pictures[one.row], three, SHEET_HEIGHT) for one, three in zip(chosen, steps, strict=True)
-    ]
+    pairs = zip(chosen, steps, strict=True)
+    strips = [frames(pictures[one.row], three, SHEET_HEIGHT) for one, three in pairs]
     rows = [np.hstack(list(strip)) for strip in strips]
     return picture(np.vstack(rows), f"First, middle and last pictures of {where}", where)
 
 
 def film_of(pictures: Sequence[Observed], chosen: Sequence[Instance], choice: int) -> Drawing:
-    """A grid of instances aligned at their onset, in H.264; one that has ended rests at its last step, paler."""
+    """A grid of instances aligned at onset, in H.264; one that has ended rests at its last step, paler."""
     longest = max(map(len, chosen))
     after = np.arange(0, longest, -(-longest // FRAMES))[:, None]
     starts, ends = np.array([(one.start, one.end) for one in chosen]).T

@@ -22,10 +22,10 @@ LOOKS = ({"stroke": "var(--ink)"}, {"stroke": "#c2410c", "stroke_dasharray": "4 
 """Of training and of tuning demonstrations."""
 
 STAGES = {
-    "vq": "“From clusters” trains each option of a level on a cluster of steps, so that options differ from the "
-    "beginning. Its values can be compared within the panel only.",
-    "parts": "“From equal parts” trains each option of a level on one of equally long parts of every demonstration. "
-    "Its values can be compared within the panel only.",
+    "vq": "“From clusters” trains each option of a level on a cluster of steps, so that options differ from "
+    "the beginning. Its values can be compared within the panel only.",
+    "parts": "“From equal parts” trains each option of a level on one of equally long parts of every "
+    "demonstration. Its values can be compared within the panel only.",
     "mixture": "“All together without memory” trains all policies while every option ends after every step.",
     "level": "“Alone” trains a level’s options while all are equally likely.",
     "meta": "“Meta-policy alone” then trains the policy that selects the options.",
@@ -41,8 +41,6 @@ def _stage_name(name: str) -> str:
         "meta-policy": "meta-policy alone",
         "joint": "all together",
         "mixture": "all together without memory",
-    }
-    whole |= {
         "segments": "levels above the lowest from segments",
         "upper": "levels above the lowest together",
     }
@@ -65,8 +63,9 @@ def learning(fit: Fit) -> Section | None:
         for (name, stage), restarts in stages.items()
     }
     caption = (
-        "Log-likelihood per step over epochs of training (solid) and tuning demonstrations (dashed). Each stage of "
-        "training has a panel with a scale of its own, and each restart a pair of lines. A steep start is cut off."
+        "Log-likelihood per step over epochs of training (solid) and tuning demonstrations (dashed). Each "
+        "stage of training has a panel with a scale of its own, and each restart a pair of lines. A steep "
+        "start is cut off."
     )
     names = dict.fromkeys(stage for _, stage in stages)
     kinds = dict.fromkeys(name.partition("-")[0] for name in names)
@@ -82,7 +81,7 @@ def _epoch(row: Mapping[str, str]) -> tuple[str, str, tuple[float, float]]:
 
 
 def _cut(restarts: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Both lines of each restart [E, 2], above a steep rise of the first epochs, which would flatten the rest."""
+    """Both lines of each restart [E, 2], above a steep rise of first epochs, which would flatten the rest."""
     every = np.concatenate(restarts)
     bottom, top = np.percentile(every, 10), every.max()
     least = top - 3 * (top - bottom) if top > bottom else every.min()
@@ -93,7 +92,7 @@ def _cut(restarts: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def doubts(fit: Fit) -> list[tuple[str, str]]:
-    """What is doubtful about a model, and what to do: its demonstrations, training, likelihood, and options."""
+    """What is doubtful about a model, and what to do: its demonstrations, training, likelihood, options."""
     metrics = fit.metrics
     unlike = reasons_told(fit.usual.unlike if fit.usual else {}, len(metrics.demonstrations_by_likelihood))
     found = [*((f"{line}.", "Repair or exclude such ones (demonstrations.exclude).") for line in unlike)]
