@@ -331,10 +331,8 @@ def inspection(facts: Inspection) -> None:
     elif facts.tasks:
         tasks = few([*facts.tasks]) if len(facts.tasks) < 4 else len(facts.tasks)
         say(printable(f"tasks: {tasks}"))
-    rows = [
-        [field.place, str(list(field.shape)), str(field.dtype), _range(field), _notes(field)]
-        for field in facts.fields.values()
-    ]
+    fields = facts.fields.values()
+    rows = [[own.place, str(list(own.shape)), str(own.dtype), _range(own), _notes(own)] for own in fields]
     printed = [list(map(printable, row)) for row in rows]
     show(Table(["", "a step", "type", "range", "notes"], printed, range(5)))
     for line in (*facts.notes, *(f"problem: {problem}" for problem in facts.problems)):

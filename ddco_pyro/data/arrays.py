@@ -178,16 +178,13 @@ def network_input(
     if len(shape) < PICTURE_DIMENSIONS:
         return "vector", ""
     if len(shape) > PICTURE_DIMENSIONS:
-        return "", (
-            f"has shape {list(shape)} at each step, and networks read vectors and pictures [H, W, C]; "
-            "store one picture a step, or reshape it to [steps, dimensions]"
-        )
+        has = f"has shape {list(shape)} at each step, and networks read vectors and pictures [H, W, C]"
+        return "", f"{has}; store one picture a step, or reshape it to [steps, dimensions]"
     if dtype == PICTURES:
         return "picture", ""
-    return "", (
-        f"has shape {list(shape)} at each step and is not uint8, as pictures have to be; scale the range "
-        "that matters to it, such as (255 * (depth / far).clip(0, 1)).astype('uint8')"
-    )
+    has = f"has shape {list(shape)} at each step and is not uint8, as pictures have to be"
+    such = "such as (255 * (depth / far).clip(0, 1)).astype('uint8')"
+    return "", f"{has}; scale the range that matters to it, {such}"
 
 
 def no_numbers(dtype: np.dtype[Any]) -> str:

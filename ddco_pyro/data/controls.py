@@ -486,10 +486,8 @@ def _resting_together(dimensions: Sequence[ControlDimension], place: str) -> lis
     groups: list[list[ControlDimension]] = []
     for dim in dimensions:
         if dim.inside is None:
-            raise SpecError(
-                f"{place}.kind: control dimension {dim.number} is at no value inside its range in "
-                f"{100 * ATOM:g} % of the steps; it is no hurdle"
-            )
+            rare = f"is at no value inside its range in {100 * ATOM:g} % of the steps; it is no hurdle"
+            raise SpecError(f"{place}.kind: control dimension {dim.number} {rare}")
         if (own := next((own for own in groups if dim.number in own[0].together), None)) is None:
             groups.append([dim])
         else:

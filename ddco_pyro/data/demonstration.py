@@ -104,13 +104,9 @@ class Demonstration:
         demo, control = object.__new__(cls), array("actions", actions)
         known = {key: array(f"labels/{key}", values) for key, values in labels.items()}
         flat = {key: each[:, 0] if each.shape[1:] == (1,) else each for key, each in known.items()}
-        vars(demo).update(
-            name=name,
-            observations={key: array(f"obs/{key}", values) for key, values in observations.items()},
-            actions=control[:, None] if control.dtype.kind in "iu" and control.ndim == 1 else control,
-            labels=flat,
-            attributes=attributes,
-        )
+        seen = {key: array(f"obs/{key}", values) for key, values in observations.items()}
+        control = control[:, None] if control.dtype.kind in "iu" and control.ndim == 1 else control
+        vars(demo).update(name=name, observations=seen, actions=control, labels=flat, attributes=attributes)
         return demo
 
     def arrays(self) -> dict[str, Observed]:
@@ -129,9 +125,8 @@ class Demonstration:
         seen = self.observations[relative_to]
         if is_picture(seen) or seen.shape != self.actions.shape:
             shapes = f"{[*seen.shape[1:]]} at each step, and the control {[*self.actions.shape[1:]]}"
-            raise DemonstrationsError(
-                f"control.relative_to: obs/{relative_to} has shape {shapes}; both have to be equal"
-            )
+            differs = f"obs/{relative_to} has shape {shapes}"
+            raise DemonstrationsError(f"control.relative_to: {differs}; both have to be equal")
         return self.actions - np.asarray(seen, np.float64)
 
     def __len__(self) -> int:

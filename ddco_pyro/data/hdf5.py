@@ -169,10 +169,9 @@ def dataset_at(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
 
 
 def _elsewhere(what: str, file: h5py.File) -> DemonstrationsError:
-    return DemonstrationsError(
-        f"{what}, which is not read; where you trust it, write all into one file: "
-        f"h5repack --merge -l CONTI {quote(file.filename)} whole.hdf5"
-    )
+    whole = f"h5repack --merge -l CONTI {quote(file.filename)} whole.hdf5"
+    remedy = f"where you trust it, write all into one file: {whole}"
+    return DemonstrationsError(f"{what}, which is not read; {remedy}")
 
 
 def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
@@ -185,9 +184,8 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
         link = item.get(part, getlink=True) if isinstance(item, h5py.Group) else None
         if link is None:
             known = datasets(group, where) if kind is h5py.Dataset else list(group)
-            raise DemonstrationsError(
-                f"{where}{key} is missing{nearest(key, known)}; there is: {', '.join(known) or 'nothing'}"
-            )
+            there = ", ".join(known) or "nothing"
+            raise DemonstrationsError(f"{where}{key} is missing{nearest(key, known)}; there is: {there}")
         if not isinstance(link, h5py.HardLink):
             raise _elsewhere(f"{where}{key} is a link to {link.path}", group.file)
         try:
@@ -196,9 +194,8 @@ def member(group: h5py.Group, key: str, kind: type, where: str) -> Any:
             text = f"cannot be opened ({error}); the file may be damaged"
             raise DemonstrationsError(f"{where}{key} {text}") from error
     if not isinstance(item, kind):
-        raise DemonstrationsError(
-            f"{where}{key} has to be a {kind.__name__.lower()}, not a {type(item).__name__.lower()}"
-        )
+        wanted, found = kind.__name__.lower(), type(item).__name__.lower()
+        raise DemonstrationsError(f"{where}{key} has to be a {wanted}, not a {found}")
     return item
 
 

@@ -235,15 +235,8 @@ class Inspection:
         leaks = (f"{place} {why}" for place, why in self.leaks.items())
         target = f"the control is a target of obs/{self.relative_to}: what follows is of their difference"
         followed = [f"{target}, control.relative_to: {self.relative_to}"] if self.relative_to else []
-        return [
-            *self.exclusions,
-            *followed,
-            *self.clocks,
-            *notes(self.control),
-            *self.coincidences,
-            *leaks,
-            *kinds,
-        ]
+        first = [*self.exclusions, *followed, *self.clocks, *notes(self.control)]
+        return [*first, *self.coincidences, *leaks, *kinds]
 
     @property
     def tasks(self) -> dict[str, list[str]]:
@@ -342,10 +335,8 @@ class _Inspector:
         found.control = control_dimensions(controls)
         odd = unlike(self.traits) | self._odd(found.control, controls)
         found.odd = {name: odd[name] for name in found.lengths if name in odd}
-        kinds = (
-            messages[0] if len(messages) == 1 else f"{messages[0]}; the first of {len(messages)} such"
-            for messages in self.problems.values()
-        )
+        every = self.problems.values()
+        kinds = (own[0] if len(own) == 1 else f"{own[0]}; the first of {len(own)} such" for own in every)
         found.problems = [*kinds, *_problems_of_division(self.source), *_problems(found)]
         self._coincidences(controls)
         found.clocks = tuple(self._clocks())
@@ -368,9 +359,8 @@ class _Inspector:
             targets = (one.key for one in seen if one.place not in found.leaks and beside[one.place].followed)
             found.relative_to = next(targets, None)
         if (key := found.relative_to) is not None:
-            found.control = control_dimensions(
-                {name: rows - self.vectors[f"obs/{key}"][name] for name, rows in controls.items()}
-            )
+            less = {name: rows - self.vectors[f"obs/{key}"][name] for name, rows in controls.items()}
+            found.control = control_dimensions(less)
         lines = [*copies(self.digests, found.masks)]
         for place, one in beside.items():
             lines += one.notes() if place not in (*found.leaks, f"obs/{key}") else ()

@@ -43,9 +43,8 @@ class Transform(NamedTuple):
         if self.crop is not None:
             top, left, *size = self.crop
             if top + size[0] > height or left + size[1] > width:
-                raise TransformError(
-                    f"crop: [{', '.join(map(str, self.crop))}] is not within {height} × {width} pixels"
-                )
+                crop = ", ".join(map(str, self.crop))
+                raise TransformError(f"crop: [{crop}] is not within {height} × {width} pixels")
             height, width = size
         return *(self.resize or (height, width)), colours
 

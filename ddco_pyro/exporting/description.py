@@ -24,9 +24,8 @@ def named(outputs: Outputs) -> dict[str, Tensor]:
     ``selection_d``: log-probabilities [K, 1 + k]. ``control_d``: the numbers of the control [K, size]. Both
     belong to the callers of level d, of which the last is the meta-policy. ``termination_d``: ψ [k].
     """
-    tensors: dict[str, Tensor | None] = {
-        f"termination_{d}": log[..., 1].double().exp() for d, log in enumerate(outputs.termination)
-    }
+    tensors = dict[str, Tensor | None]()
+    tensors |= {f"termination_{d}": log[..., 1].double().exp() for d, log in enumerate(outputs.termination)}
     for level, caller in enumerate(outputs.callers):
         tensors |= {f"selection_{level}": caller.selection, f"control_{level}": caller.numbers}
     return {name: tensor for name, tensor in tensors.items() if tensor is not None}

@@ -108,9 +108,8 @@ def _episode(encoder: ObservationEncoder, steps: int, random: np.random.Generato
     Angles are of a turn, and quaternions have norm 1.
     """
     observations: dict[str, np.ndarray] = {}
-    means, stds = (
-        (part.numpy() for part in statistic.split(encoder.sizes)) for statistic in (encoder.mean, encoder.std)
-    )
+    each = (statistic.split(encoder.sizes) for statistic in (encoder.mean, encoder.std))
+    means, stds = ((part.numpy() for part in parts) for parts in each)
     for spec, mean, std in zip(encoder.specs, means, stds, strict=True):
         if spec.key == STEP:
             continue

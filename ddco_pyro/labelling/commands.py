@@ -179,11 +179,8 @@ class View:
         ):
             raise BadInput(f"accept: these are no segments of {name}")
         options = np.where(labels == FREE, np.repeat(options, lengths), 0)
-        confirmed = [
-            (CONFIRM, name, start, stop, option)
-            for option, start, stop in runs(options, np.diff(options, prepend=-1) != 0)
-            if option
-        ]
+        segments = runs(options, np.diff(options, prepend=-1) != 0)
+        confirmed = [(CONFIRM, name, start, stop, option) for option, start, stop in segments if option]
         said = np.where(labels == FREE, options, labels)
         accepted = Shown(np.where(labels == OPEN, self.shown[name].options, said), np.ones(last))
         wrong = first_wrong(self.first.get(name, self.shown[name]), accepted)
@@ -201,11 +198,8 @@ class View:
             raise BadInput(f"move: step {to} is not within {beside}")
         sides = [(segment, OPEN if segment.source == "open" else segment.option) for segment in (left, right)]
         low, high = min(boundary, to) - 1, max(boundary, to) + 1
-        changes: list[Change] = [
-            (PAINT, name, *ends, option)
-            for (_, option), ends in zip(sides, ((low, to), (to, high)), strict=True)
-            if option
-        ]
+        pairs = zip(sides, ((low, to), (to, high)), strict=True)
+        changes: list[Change] = [(PAINT, name, *ends, option) for (_, option), ends in pairs if option]
         if boundary in self.document.cuts[name]:
             changes += [("cut", name, boundary, False), ("cut", name, to, True)]
         return changes

@@ -140,10 +140,8 @@ class Proposals:
             self.place |= {name: (place, row) for row, name in enumerate(piece.names)}
         with torch.no_grad():
             self.alone = [piece.outputs.tables(piece.batch.actions) for piece in self.pieces]
-        alone = [
-            Inferred(piece.names, piece.batch, piece.hierarchy, tables)
-            for piece, tables in zip(self.pieces, self.alone, strict=True)
-        ]
+        pairs = zip(self.pieces, self.alone, strict=True)
+        alone = [Inferred(piece.names, piece.batch, piece.hierarchy, tables) for piece, tables in pairs]
         self.alone_u = [piece.posterior.u[level - 1] for piece in alone]
         rows = [piece.segmented(row)[level - 1] for piece in alone for row in range(len(piece.names))]
         every_run = [run for row in rows for run in runs(*row)]

@@ -90,9 +90,8 @@ def _tuned(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
 
 def _padded(rows: list[np.ndarray]) -> Tensor:
-    return torch.nn.utils.rnn.pad_sequence(
-        [torch.as_tensor(row).long() for row in rows], batch_first=True, padding_value=-1
-    )
+    each = [torch.as_tensor(row).long() for row in rows]
+    return torch.nn.utils.rnn.pad_sequence(each, batch_first=True, padding_value=-1)
 
 
 def refit_spec(trained: Fit, level: str, count: int) -> Spec:

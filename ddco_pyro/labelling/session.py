@@ -295,9 +295,8 @@ class Session:
         lengths, accepted = self.document.lengths, self.document.accepted
         wrong, steps = np.array([*self._wrong().values()]), np.array([*lengths.values()])
         edits = 1 + np.array([len(self.segments[name]) for name in lengths]) * wrong / steps
-        self.order, self.farthest = ranking(
-            wrong, edits, self.proposals.whole, np.array([name in accepted for name in lengths])
-        )
+        done = np.array([name in accepted for name in lengths])
+        self.order, self.farthest = ranking(wrong, edits, self.proposals.whole, done)
         left_out, names = self.excluded, self.demos.names
         others = {name for name, people in self.shares.items() if people and self.team.me not in people}
         self.order.sort(key=lambda place: [names[place] in last for last in (left_out, accepted, others)])

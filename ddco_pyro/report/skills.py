@@ -11,17 +11,7 @@ import numpy as np
 from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.drawing.figures import curves, film, picture, transition_graph, typical_paths
-from ddco_pyro.drawing.page import (
-    Block,
-    Card,
-    Cell,
-    Columns,
-    Drawing,
-    Facts,
-    Section,
-    Text,
-    note,
-)
+from ddco_pyro.drawing.page import Block, Card, Cell, Columns, Drawing, Facts, Section, Text, note
 from ddco_pyro.drawing.shown import frames, in_words, positions, projection
 from ddco_pyro.drawing.words import duration, number, percent
 from ddco_pyro.evaluation.options import diagnose

@@ -161,10 +161,8 @@ class Spec(Model):
         for place, key in dict.fromkeys(named):
             if key not in self.observed:
                 there = ", ".join(self.observed)
-                yield (
-                    place,
-                    f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}",
-                )
+                text = f"there is no observation {key!r}{nearest(key, self.observed)}; there is: {there}"
+                yield place, text
 
     def _labelled(self) -> Problems:
         names, known = self.demonstrations.labels, [level.name for level in self.levels]

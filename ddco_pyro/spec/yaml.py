@@ -180,10 +180,6 @@ def _refuse_user_code(spec: Spec, path: str | Path) -> None:
     tried = ((key, value) for key, values in spec.selection.grid.items() for value in values)
     grid = {f"selection.grid.{key}": name for key, value in tried for _, name in _code_in(value, key)}
     if places := user_code(spec) | grid:
-        raise SpecError(
-            *(
-                f"{path}: {place}: would import user code ({name}); pass --allow-code if you trust it "
-                "(in Python: allow_code=True)"
-                for place, name in places.items()
-            )
-        )
+        trust = "pass --allow-code if you trust it (in Python: allow_code=True)"
+        named = [f"{place}: would import user code ({name})" for place, name in places.items()]
+        raise SpecError(*(f"{path}: {problem}; {trust}" for problem in named))

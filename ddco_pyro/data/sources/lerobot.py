@@ -76,9 +76,8 @@ class LeRobot:
                 raise DemonstrationsError(f"{path}: says nothing of features; is it LeRobot's?")
         version = str(self.info.get("codebase_version", "of no version"))
         if not version.startswith(VERSION):
-            raise DemonstrationsError(
-                f"{folder}: is a LeRobot dataset {version}, and {VERSION}x can be read; {_CONVERT}"
-            )
+            other = f"is a LeRobot dataset {version}, and {VERSION}x can be read"
+            raise DemonstrationsError(f"{folder}: {other}; {_CONVERT}")
         self.features: dict[str, Any] = self.info["features"]
         observed = [feature for feature in self.features if feature.startswith(OBSERVATION)]
         bare = [feature.removeprefix(OBSERVATION) for feature in observed]
@@ -122,10 +121,9 @@ class LeRobot:
             if feature not in there:
                 close = [name for name in there if name.startswith(ACTION)] or there
                 such = f", such as --action {quote(close[0])}" if close else ""
-                raise DemonstrationsError(
-                    f"{self.folder}: there is no feature {feature!r}{nearest(feature, there)}; there is: "
-                    f"{', '.join(there) or 'none'}; import the control with --action{such}"
-                )
+                known = ", ".join(there) or "none"
+                lacks = f"there is no feature {feature!r}{nearest(feature, there)}; there is: {known}"
+                raise DemonstrationsError(f"{self.folder}: {lacks}; import the control with --action{such}")
 
     def _annotations(self) -> list[str]:
         """Read the subtasks of each annotated episode as (first step, number of its name), -1 for none.

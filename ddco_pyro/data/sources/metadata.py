@@ -81,9 +81,8 @@ def filled(folder: Path, template: str, values: Mapping[str, int | str]) -> str:
     path = re.sub(placeholder, lambda found: str(values[found[1]]).zfill(int(found[2] or 0)), template)
     if {*path} & {*"{}"}:
         known = ", ".join(f"{{{name}}}" for name in values)
-        raise DemonstrationsError(
-            f"{folder}: the path {template[:200]!r} may have only {known}, and numbers as {{chunk_index:03d}}"
-        )
+        allowed = f"may have only {known}, and numbers as {{chunk_index:03d}}"
+        raise DemonstrationsError(f"{folder}: the path {template[:200]!r} {allowed}")
     return path
 
 
@@ -98,9 +97,8 @@ def joined(parts: Mapping[str, np.ndarray], where: str) -> np.ndarray:
     first, steps = next((name, len(array)) for name, array in parts.items())
     for name, array in parts.items():
         if array.dtype.kind not in NUMBERS:
-            raise DemonstrationsError(
-                f"{where}: {name} holds {array.dtype}, not numbers; name the control with --action"
-            )
+            holds = f"{name} holds {array.dtype}, not numbers"
+            raise DemonstrationsError(f"{where}: {holds}; name the control with --action")
         if len(array) != steps:
             raise DemonstrationsError(f"{where}: {name} has {len(array)} steps, but {first} has {steps}")
     flat = [array.reshape(steps, math.prod(array.shape[1:])) for array in parts.values()]

@@ -42,9 +42,8 @@ def frames_of_steps(
     """
     where = f"{name}: {path}"
     if not path.is_file():
-        raise DemonstrationsError(
-            f"{where}: the video is missing; leave its observation out with --observation"
-        )
+        missing = "the video is missing; leave its observation out with --observation"
+        raise DemonstrationsError(f"{where}: {missing}")
     seen = 0
     try:
         for time, frame in islice(frames(path, max(start - 0.5 / frequency, 0)), steps):

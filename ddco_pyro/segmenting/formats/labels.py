@@ -69,9 +69,8 @@ def check_labels(path: Path, given: Iterable[str], names: Iterable[str]) -> None
             for label in labels:
                 if label in group and group[label].attrs.get(OURS) != SIGNATURE:
                     foreign = f"labels/{label} exists and was not written by ddco-pyro segment"
-                    raise BadInput(
-                        f"{path}: {name}: {foreign}; give the level another name in the run's spec"
-                    )
+                    remedy = "give the level another name in the run's spec"
+                    raise BadInput(f"{path}: {name}: {foreign}; {remedy}")
 
 
 def is_copy(out: Path, path: Path) -> bool:

@@ -108,10 +108,8 @@ def _one_order(asked: Asked, segmented: Segmented) -> tuple[list[str], dict[str,
         raise BadInput(f"{asked.option}: {single}: there is no end to mark")
     if problems and not (asked.same_order and len(problems) < len(runs)):
         name, problem = next(iter(problems.items()))
-        share = f"({len(problems)} of {len(runs)})"
-        raise BadInput(
-            f"{asked.option}: {name}: {problem}; --same-order leaves such demonstrations out {share}"
-        )
+        remedy = f"--same-order leaves such demonstrations out ({len(problems)} of {len(runs)})"
+        raise BadInput(f"{asked.option}: {name}: {problem}; {remedy}")
     names = [
         f"{name}_{common[:place].count(name) + 1}" if name in common[:place] else name
         for place, name in enumerate(common)
