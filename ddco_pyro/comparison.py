@@ -388,7 +388,7 @@ def verdict(compared: Comparison) -> str:
 
 
 def _links(compared: Comparison, folder: Path) -> dict[str, str]:
-    """Addresses of demonstrations' segments in the report of the run that sorts them, from ``folder`` on."""
+    """Addresses of demonstrations' segments in the report of the run that sorts, relative to ``folder``."""
     report = Path(compared.sorted_by) / "report.html"
     text = report.read_text(encoding="utf-8") if report.exists() else ""
     address = quote(Path(os.path.relpath(report, folder)).as_posix())

@@ -270,7 +270,7 @@ def encode(
     on_event: OnEvent = ignore,
     allow_code: bool = False,
 ) -> Encoder:
-    """Write the demonstrations of ``path`` to ``out``, with features for pictures, and return the encoder.
+    """Write the demonstrations of ``path`` to ``out``, features in place of pictures; return the encoder.
 
     ``out`` holds the encoder, too. Principal components are those of the training demonstrations:
     ``mask/train``, else all that are not in ``mask/valid``.

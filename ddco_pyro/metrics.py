@@ -1,4 +1,4 @@
-"""The contents of ``metrics.json`` (:class:`Metrics`), how its numbers are shown (:data:`METRICS`), reading.
+"""Contents of ``metrics.json`` (:class:`Metrics`), how numbers are shown (:data:`METRICS`), reading files.
 
 Log-likelihoods are in nats.
 """
@@ -145,7 +145,7 @@ class Parts(Record, Generic[T]):
 class Marginal(Parts[Finite]):
     """The log-likelihood per step of a density of the control that reads no observation.
 
-    It has the model's kinds, and is fitted to training demonstrations. ``controls``: dimensions that vary.
+    It has the model's kinds, fitted to training demonstrations. ``controls``: how many dimensions vary.
     """
 
     controls: AtLeastOne
@@ -339,7 +339,7 @@ class Listed(Record):
 
 
 class BranchUse(Record):
-    """Use of branches of a level's networks, by option, branch (:mod:`ddco_pyro.evaluation.branch_use`)."""
+    """Use of a level's branches, by option and branch (:mod:`ddco_pyro.evaluation.branch_use`)."""
 
     level: int
     branches: Annotated[list[str], Field(min_length=1)]
@@ -530,8 +530,7 @@ class Agreement(Record):
     """Agreement of each level's segments with the labels so named; None where no label is known.
 
     ``equal_train`` and ``equal_valid`` are of demonstrations that are cut into equal parts, as many as there
-    are options. ``recogniser`` has, by part, the options that a recogniser alone finds at each step of its
-    level.
+    are options. ``recogniser``: by part, what options a recogniser alone finds at each step of its level.
     """
 
     labels: list[str]

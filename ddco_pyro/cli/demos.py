@@ -60,7 +60,7 @@ def inspect(
     wheres: Wheres = [],  # noqa: B006
     tolerance: Annotated[int, option("Steps between boundaries that match, for --against.", min=0)] = 5,
 ) -> None:
-    """Print the contents of a file: keys, shapes, lengths, ranges, NaN, constants, masks, a starting spec."""
+    """Print a file's keys, shapes, lengths, ranges, NaN, constant dimensions, masks, and a starting spec."""
     if against is not None:
         from ddco_pyro.cli import console
         from ddco_pyro.evaluation.agreement import compare_annotators

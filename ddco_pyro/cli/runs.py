@@ -42,7 +42,7 @@ def compare(
     ] = None,
     allow_code: AllowCode = False,
 ) -> None:
-    """Compare runs on demonstrations that all of them held out, and on rollouts from equal initial states."""
+    """Compare runs on demonstrations that all held out, and on rollouts from the same initial states."""
     from ddco_pyro import comparison
     from ddco_pyro.cli import console
 

@@ -73,8 +73,7 @@ class Traits:
     :param sizes: by place, the size, the span, and the mean and the largest change in a step of each number
         [4, D].
     :param jumps: by place, the step of each largest change; -1 where another is nearly as large [D].
-    :param correlations: by place, of each control with each number, its change, and for ``actions`` time [A,
-        F].
+    :param correlations: by place, of each control with each number, its change, for ``actions`` time [A, F].
     """
 
     name: str

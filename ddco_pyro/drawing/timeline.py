@@ -68,8 +68,7 @@ def coded(
 
     :param starts: first steps.
     :param values: the option or the label of each segment.
-    :param intervals: of each first step, [segments, 2]; None for labels. Those that are a single step are
-        left out.
+    :param intervals: of each first step, [segments, 2], single steps left out; None for labels.
     :param probability: of the option at each step [T]; None for labels.
     """
     found: dict[str, Any] = {"s": list(starts), "v": list(values)}

@@ -65,7 +65,7 @@ def deciding(fit: Fit, demos: Demonstrations) -> dict[str, dict[str, dict[int, s
 def _shares(
     numbers: Tensor, weight: Tensor, vectors: Mapping[str, Tensor], spread: Mapping[str, Tensor]
 ) -> dict[str, float]:
-    """Each observation's share in the size of the gradient of ``numbers`` [N, T, P], weighted: ``weight``."""
+    """Each observation's share in the gradient's size, of ``numbers`` [N, T, P], weighted by ``weight``."""
     sizes = dict.fromkeys(vectors, 0.0)
     for each in numbers.unbind(-1):
         if not each.requires_grad:

@@ -81,7 +81,7 @@ def _epoch(row: Mapping[str, str]) -> tuple[str, str, tuple[float, float]]:
 
 
 def _cut(restarts: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Both lines of each restart [E, 2], above a steep rise of first epochs, which would flatten the rest."""
+    """Both lines of each restart [E, 2], above a steep rise at first, which would flatten the rest."""
     every = np.concatenate(restarts)
     bottom, top = np.percentile(every, 10), every.max()
     least = top - 3 * (top - bottom) if top > bottom else every.min()

@@ -124,8 +124,7 @@ class BaselineSpec(Model):
     std: LearnedStd | None = None
     """In ``compare_with``: the σ of this baseline wherever σ is learned in ``control.std`` and
     ``control.parts``. Null: as in ``control``. The floor stays unless ``floor`` is given. With ``{learn:
-    true, per_state: true}`` the σ of a flat policy depends on the state, as the σ of options differs between
-    options."""
+    true, per_state: true}`` the σ of a flat policy depends on the state, as σ differs between options."""
 
     def problems(self) -> Problems:
         network = self.policy.network

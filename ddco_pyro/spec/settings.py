@@ -51,8 +51,7 @@ class DemonstrationsSpec(Model):
     """An attribute of demonstrations, such as the operator: all demonstrations with some of its values are
     held out, about ``valid_fraction`` of all, whatever masks the file has. The spec's ``seed`` draws the
     values. With ``demonstration``, every demonstration trains the model. Held-out results of a demonstration
-    are then of a further fit, which leaves it out. For few demonstrations; ``valid_fraction`` does not
-    apply."""
+    are then of a further fit without it. For few demonstrations; ``valid_fraction`` does not apply."""
     exclude: Items[Text] = ()
     """Names of demonstrations that are not read."""
     where: dict[str, Annotated[Items[Text], Field(min_length=1)]] = Field(default={})
@@ -121,8 +120,7 @@ class ObservationSpec(Model):
     behind the other numbers, so that nothing jumps where the angle does by 2π."""
     quaternions: Items[Annotated[int, Field(ge=0)]] = ()
     """For vectors: the first of each four numbers that are a unit quaternion, in either order. Each becomes
-    the ten products of two of its numbers, of which a rotation matrix consists, and which are the same for q
-    and −q."""
+    the ten products of two of its numbers, of which rotation matrices consist, the same for q and −q."""
     bins: Annotated[int, Field(ge=0, le=64)] = 0
     """For vectors: bins of a piecewise-linear encoding, appended to each number and each difference. A bin
     holds the number clipped to one part of its range; the parts hold equally many distinct values. Networks
@@ -178,8 +176,7 @@ class LearnedStd(Model):
     """Lower bound, in scaled units."""
     per_option: bool = False
     """Whether each option has its own σ. ``gaussian`` controls that often equal a bound or value let one
-    option collect those steps, independent of the skill; ``clipped``, ``hurdle`` and ``binary`` controls do
-    not."""
+    option collect those steps, whatever the skill; ``clipped``, ``hurdle`` and ``binary`` controls do not."""
     per_state: bool = False
     """Whether σ depends on the observations: the policy's network outputs σ beside the mean. Each option, and
     a flat policy, has its own σ."""
@@ -293,8 +290,7 @@ class PathSpec(NamedTuple):
     """Two or three numbers of an observation that are drawn as a path in space.
 
     :param key: name of the observation.
-    :param numbers: which of its numbers, as a Python slice such as ``3:6``; None: the first three, or both of
-        two.
+    :param numbers: which of its numbers, as a slice such as ``3:6``; None: the first three, or both of two.
     """
 
     key: str

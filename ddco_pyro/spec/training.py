@@ -47,8 +47,7 @@ class RecogniserSpec(Model):
     """A recogniser of the options of labelled steps; its evidence places the options of unlabelled steps."""
 
     weight: float = Field(default=0.3, ge=0)
-    """γ: how many times log r(h | window) − log p(h) counts, beside the control's log-density
-    (``control.power``)."""
+    """γ: how many times log r(h | window) − log p(h) counts beside the log-density (``control.power``)."""
     ridge: Positive = 50.0
     """Precision of a normal prior on the weights of standardised features."""
 

@@ -7,7 +7,7 @@ included; and ``meta_file_TASK.txt``, a row of a name, a self-stated skill and a
 A row has 19 numbers for each of four arms: position [3] in m, rotation matrix [9], velocity [3] in m/s,
 angular velocity [3] in rad/s, and the gripper's angle in rad. The order is master left, master right, and the
 instruments that the files' own documentation calls slave left and slave right. The left master drives the
-*last* instrument: each displacement of that one is half of the master's. Here arms have the surgeon's hands.
+*last* instrument: each displacement of that one is half the master's. Arms are named by the surgeon's hand.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The formats of segments, a row each: a function that writes, in a module of its own.
 
 ``write(asked, segmented)`` writes a file or folder, whole or not at all, and returns in words what was
-written. ``check(asked)`` of formats that copy demonstrations refuses these or an existing place before
-anything is segmented.
+written. ``check(asked)`` of formats that copy demonstrations refuses these or an existing place first.
 """
 
 from __future__ import annotations

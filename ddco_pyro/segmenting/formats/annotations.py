@@ -118,8 +118,7 @@ def write_rerun(asked: Asked, segmented: Segmented) -> str:
     """A folder with ``<demonstration>.rrd``, over the timeline ``step``, and ``time`` if the rate is known.
 
     ``segments/<level>`` has a ``StateChange`` at the first step of each segment, a lane of the state
-    timeline. Beside it are the posterior probability of the active option, the controls, and the
-    observations.
+    timeline. Beside it are the active option's posterior probability, the controls and the observations.
     """
     with whole_folder(asked.out) as folder:
         for demo in segmented.segments:
