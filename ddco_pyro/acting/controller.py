@@ -52,9 +52,8 @@ class Controller:
 
     :param hierarchy: such as ``fit.hierarchy``.
     :param control: execute the ``mean`` control or a ``sample``.
-    :param options: ``sample`` terminations and selections; take the ``most_likely`` of each; or take the
-        choices with the largest ``marginal`` p(h_t | s_0, ..., s_t), which accumulates the probability that
-        options have ended.
+    :param options: ``sample`` terminations and selections; take the ``most_likely`` of each; or the choices
+        with the largest ``marginal`` p(h_t | s_0, ..., s_t), which adds up how likely options have ended.
     :param seed: of the first episode.
     :param names: the names of the choices of each level, lowest first, such as ``fit.names``.
     :raises BadInput: one of these is something else.

@@ -21,8 +21,7 @@ from ddco_pyro.names import choice_names
 
 
 class Monitor:
-    """An online filter of another agent's options: call :meth:`step` with each observation and the previous
-    control.
+    """An online filter of another agent's options: call :meth:`step` with observations and previous controls.
 
     >>> monitor = fit.monitor()
     >>> demo = demos[0]
@@ -32,8 +31,7 @@ class Monitor:
     >>> active["option"]["control"], round(sum(active["option"].values()), 6)  # and a number for each option
     (0.0, 1.0)
 
-    :param names: the names of the choices of each level, lowest first, such as ``fit.names``; by default
-        numbers.
+    :param names: of the choices of each level, lowest first, such as ``fit.names``; by default numbers.
     :ivar belief: the exact belief after :meth:`step`, of each level [1, 1 + k], lowest first.
     :raises BadInput: ``hierarchy`` is something else.
     """

@@ -43,13 +43,10 @@ def agreement(
 ) -> Scores | None:
     """All measures over demonstrations, each at most 1 (perfect); None where no step has a known label.
 
-    Of several tasks, measures are means over tasks: options are matched with the labels of one task at a
-    time.
+    Of several tasks, measures are means over tasks: options are matched with the labels of each task alone.
 
-    :data:`EXPLAINED` says what they measure. Boundaries are matched one to one; where neither side has any,
-    their F1 is
-    1. A segment is compared with the segment of its label with which it overlaps most, and that is taken
-       once.
+    :data:`EXPLAINED` says what they measure. Boundaries are matched one to one; F1 is 1 where neither side
+    has any. A segment is compared with that segment of its label with which it overlaps most, taken once.
 
     >>> found = agreement([np.array([7, 7, 3, 3])], [np.array([0, 0, 0, 1])])
     >>> found.matched_globally.accuracy, found.boundary_f1_1
@@ -122,8 +119,7 @@ def of_equal_lengths(
 
     Of several tasks, into as many as options are used in the task (:data:`USED`).
 
-    :param segments: the options [T] of each demonstration, of several tasks; ``tasks`` as of
-        :func:`agreement`.
+    :param segments: the options [T] of each demonstration; ``tasks`` as in :func:`agreement`.
     """
     if not are_several(tasks):
         return agreement([equal_lengths(len(own), count) for own in labels], labels)
@@ -165,8 +161,7 @@ def _known(
 
 
 def _numbered(sequences: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The distinct values, and each sequence with values replaced by numbers in the order of first
-    appearance.
+    """The distinct values, and each sequence as numbers of the values in the order of first appearance.
 
     The choice between equally good matchings then does not depend on names.
     """
@@ -218,8 +213,7 @@ def _boundary_f1(ours: Sequence[np.ndarray], truth: Sequence[np.ndarray], tolera
 
 
 def boundary_distances(ours: np.ndarray, theirs: np.ndarray, tolerance: int) -> np.ndarray:
-    """Distances of sorted steps that are matched one to one within a tolerance: most pairs, and the closest
-    of these.
+    """Distances of sorted steps that are matched one to one within a tolerance: most pairs, and the closest.
 
     >>> boundary_distances(np.array([10, 12]), np.array([12, 40]), 3).tolist()
     [0]
@@ -296,10 +290,8 @@ class Annotators:
     """How two annotators agree. Boundaries are compared where both say something of the steps on both sides.
 
     :param demonstrations: which both have.
-    :param steps: of these demonstrations; ``both`` of them are said by both annotators, ``same`` with the
-        same name.
-    :param kappa: Cohen's κ over the steps that both said; None without such steps, or where there is one name
-        alone.
+    :param steps: of these demonstrations; both annotators say ``both`` of them, ``same`` with the same name.
+    :param kappa: Cohen's κ over the steps that both said; None without such steps, or with one name alone.
     :param boundaries: the number of each annotator.
     :param distances: of the boundaries that match within the tolerance, in steps, sorted.
     :param names: in the order of their numbers.

@@ -26,8 +26,7 @@ def branch_use(hierarchy: Hierarchy, pieces: Iterable[Inferred]) -> list[BranchU
     """The use of branches in each level whose policies have branches, lowest first, the meta-policy last.
 
     ``level`` is the number of the level from 0, ``branches`` has the names of the branches. Two tables have a
-    row for each option and a column for each branch, weighted by the posterior probability that the option is
-    active:
+    row for each option and a column for each branch, weighted by the probability that the option is active:
 
     - ``activation``: the mean absolute value of the branch's output;
     - ``loss``: the loss in nats per step, of the option's control or the meta-policy's choices, where the
@@ -61,8 +60,7 @@ def _branched(hierarchy: Hierarchy) -> dict[int, Branches]:
 
 
 def _sums(piece: Inferred, level: int, branch: nn.Module) -> Tensor:
-    """Over the steps, of each caller of a level: activation and loss of a branch, weighted, and the weights,
-    [K, 3].
+    """Over steps, of each caller of a level: activation and loss of a branch, weighted, and weights, [K, 3].
 
     A weight is the posterior probability that the caller is active.
     """

@@ -37,12 +37,10 @@ DRAWS = 100
 def drawn(
     path: np.ndarray, starts: np.ndarray, options: np.ndarray, chosen: np.ndarray
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Each boundary of a path, and its steps in those draws from the posterior p(ζ | ξ) that have it,
-    ascending.
+    """Each boundary of a path, and its steps in the draws from p(ζ | ξ) that have it, ascending.
 
-    A boundary is a step at which option a ends and option b begins. A draw has the boundary where it has a
-    step with the same a and b between the two neighbouring boundaries of the path; its nearest such step
-    counts.
+    A boundary is a step at which option a ends and option b begins. A draw has it where it has a step with
+    the same a and b between the two neighbouring boundaries of the path; its nearest such step counts.
 
     >>> path, starts = np.array([1, 1, 2, 2]), np.array([True, False, True, False])
     >>> options = np.array([[1, 1, 2, 2], [1, 2, 2, 2], [1, 1, 1, 1]])
@@ -79,8 +77,7 @@ def within(at: np.ndarray, step: int, mass: float = 0.9) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class Inferred:
-    """The inference for N demonstrations, padded to the longest, T steps; each result is computed when first
-    read.
+    """The inference for N demonstrations, padded to the longest, T steps; computed when first read.
 
     :param names: of the demonstrations.
     :param batch: the demonstrations, encoded for the networks.

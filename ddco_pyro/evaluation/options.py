@@ -115,8 +115,7 @@ def divergences(pieces: Iterable[tuple[Outputs, Posterior]]) -> list[list[Alike]
     """The ``divergence`` of each pair of ``options`` of each level, lowest first, nats per step.
 
     The divergence is the mean of KL(π_i ‖ π_j) and KL(π_j ‖ π_i), averaged over steps with weights u_t(i) +
-    u_t(j); None where neither option is ever active. Two options with divergence 0 are one skill under two
-    numbers.
+    u_t(j); None where neither option is ever active. Two options with divergence 0 are one skill twice.
 
     :param pieces: outputs of the networks and posteriors of demonstrations.
     """
@@ -326,8 +325,7 @@ def unlabelled_start(training: TrainingSpec) -> list[tuple[str, str]]:
 
 
 def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
-    """The findings of :func:`diagnose` in words, those of a kind and level as one sign, with the usual
-    remedy.
+    """The findings of :func:`diagnose` in words, one sign for a kind and level, with the usual remedy.
 
     Signs that labels show follow.
 
@@ -348,8 +346,7 @@ def degeneracies(metrics: Metrics, spec: Spec, names: Mapping[str, Sequence[str]
 
 
 def beside_equal_parts(metrics: Metrics) -> list[tuple[str, bool]]:
-    """How options of each level with labels agree with them, and whether equal parts of each demonstration do
-    better.
+    """How each level's options agree with its labels, and whether equal parts of demonstrations do better.
 
     On held-out demonstrations where there are any.
     """

@@ -330,8 +330,7 @@ def tested(metrics: Metrics) -> str:
 def _over_seeds(
     name: str, values: Sequence[float], error: float, trials: int, smallest: float = 0.0
 ) -> tuple[Direction, str]:
-    """The direction of a difference over training seeds, and its mean with the wider of two intervals, in
-    words.
+    """The direction of a difference over training seeds, and its mean with the wider interval, in words.
 
     :param name: of :data:`~ddco_pyro.metrics.METRICS`.
     :param error: over so many trials, as in :func:`~ddco_pyro.statistics.wider_interval`.
@@ -350,8 +349,7 @@ def _lasting(way: Direction, lead: str, held_out: int, brief: str, seeds: int = 
 
 
 def twitches(segments: Sequence[Segments], frequency: float | None) -> str:
-    """How often the options of the lowest level switch, in a sentence, with the share of twitches where they
-    do often.
+    """How often options of the lowest level switch, in a sentence; the share of twitches if they often do.
 
     Empty without options.
     """
@@ -421,8 +419,7 @@ def recogniser(training: Training) -> str:
 
 
 def contributions(training: Training) -> dict[str, tuple[float, float]]:
-    """What labels, recogniser and policies contribute: accuracy and edit score of left-out labelled
-    demonstrations.
+    """What labels, recogniser and policies add: accuracy and edit score of left-out labelled demonstrations.
 
     Means over ridges, by which the first row was chosen; empty without cross-validation.
     """

@@ -25,12 +25,10 @@ FORMAT = 5
 
 
 class Digest(Record):
-    """The digest of demonstrations: ``names`` in order, SHA-256 of controls, observations and labels, and
-    ``masks``.
+    """The digest of demonstrations: ``names`` in order, SHA-256 of controls, observations, labels, ``masks``.
 
     :param format: the version of the run folder's format.
-    :param files: size, time of the last change (ns) and inode of the file with the pictures of an
-        observation.
+    :param files: size, time of the last change (ns) and inode of the file with an observation's pictures.
     :param usual: what the demonstrations have in common; None where a folder lacks it.
     """
 

@@ -21,8 +21,7 @@ class Boundary(NamedTuple):
     """A boundary of the most likely path, and where draws have it.
 
     :param step: the first step of the new segment.
-    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has the
-        boundary.
+    :param low: the first step of the interval; ``high`` is its last. Both are ``step`` if no draw has it.
     :param probability: the share of draws that have the boundary.
     """
 
@@ -34,14 +33,11 @@ class Boundary(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Draws from p(ζ | ξ) of each demonstration, independent of each other, by forward filtering, backward
-    sampling.
+    """Independent draws from p(ζ | ξ) of each demonstration, by forward filtering, backward sampling.
 
     :param options: choices by level, int8 [chain, draw, N, T]; −1 past a demonstration's end. A chain is a
-        model: the fit, then those of ``fit --seeds``, whose options are numbered like the fit's
-        (:func:`matched`).
-    :param starts: whether an option is selected at a step, which may be the same as before, bool [chain,
-        draw, N, T].
+        model: the fit, then those of ``fit --seeds`` with options numbered like the fit's (:func:`matched`).
+    :param starts: whether an option, maybe the same as before, is selected, bool [chain, draw, N, T].
     :param log_likelihood: log p(ξ), nats, [chain, N].
     :param demonstrations: their names.
     :param names: the names of the choices by level, control first.
@@ -152,8 +148,7 @@ def draw(
 def _chain(
     model: Iterable[Inferred], draws: int, seed: tuple[int, int]
 ) -> tuple[list[str], np.ndarray, list[np.ndarray], list[torch.Tensor]]:
-    """The demonstrations and log p(ξ) under a model, with the draws [2, D, draw, T] of choices and
-    terminations.
+    """The demonstrations and log p(ξ) under a model, with draws [2, D, draw, T] of choices and terminations.
 
     At last the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 + k_d)].
     """
@@ -177,8 +172,7 @@ def matched(
     Options are matched one to one, so that the expected number of steps in which both models have the matched
     options is largest (Hungarian assignment). Choice 0 stays.
 
-    :param ours: the posterior u of each demonstration, the levels' choices beside each other, [T, Σ (1 +
-        k_d)].
+    :param ours: the posterior u of each demonstration, levels' choices beside each other, [T, Σ (1 + k_d)].
     :param sizes: 1 + k_d of each level.
     """
     together = torch.cat(list(ours)).T @ torch.cat(list(theirs))

@@ -44,8 +44,7 @@ class OptionSegmenter(BaseEstimator):
     ``score``, ``decode``, ``predict`` and ``predict_proba`` condition on all of a sequence.
 
     Without U, as in hmmlearn, X is emitted by the options, and there is no observation: a hidden Markov model
-    with the transition matrix diag(1 − ψ) + ψ ηᵀ, ``transmat_``. A one-dimensional second argument is
-    hmmlearn's ``lengths``.
+    with transition matrix diag(1 − ψ) + ψ ηᵀ, ``transmat_``. A one-dimensional U is hmmlearn's ``lengths``.
 
     >>> X, U = [demo.observations["place"] for demo in demos], [demo.actions for demo in demos]
     >>> model = ddco_pyro.OptionSegmenter(2, random_state=0).fit(X, U)
@@ -62,8 +61,7 @@ class OptionSegmenter(BaseEstimator):
     :param random_state: the seed of the fit, a ``RandomState``, or None for another seed in each fit.
     :param settings: other settings by their key path in a spec, such as ``{"training.layerwise": False}``.
 
-    ``fit_`` is the :class:`~ddco_pyro.Fit`, ``spec_`` its spec, ``n_features_in_`` the number of columns of
-    X.
+    ``fit_`` is the :class:`~ddco_pyro.Fit`, ``spec_`` its spec, ``n_features_in_`` the number of X's columns.
     """
 
     def __init__(

@@ -67,8 +67,7 @@ class _Part:
     :param dimensions: the parts of the same that each control dimension in the model has, [N, A'].
     :param options: and the part that the choice of options has, [N] (:func:`decompose`).
     :param segments: the most likely options [T] of each demonstration, for each level.
-    :param recognised: the options that a recogniser alone finds, [T] of each demonstration; empty without
-        one.
+    :param recognised: the options that a recogniser alone finds, [T] of each demonstration; else empty.
     """
 
     values: np.ndarray
@@ -122,8 +121,7 @@ def decompose(outputs: Outputs, batch: Batch) -> tuple[Tensor, Tensor]:
 
 
 def _as_own(fit: Fit, demos: Demonstrations) -> Callable[[Inferred], tuple[Tensor, ...]]:
-    """The most likely choices of a piece by the model without its demonstration, with the numbers of a fit's
-    own.
+    """The most likely choices of a piece by the model without its demonstration, numbered as a fit's own.
 
     Options are matched so that both models agree on as many steps of the other demonstrations as possible.
     """
@@ -187,8 +185,7 @@ def evaluate(
     """The evaluation of a model.
 
     It has the log-likelihood in nats per step of each part of the data and of each demonstration, and the
-    paired difference to every baseline. A hierarchy also has the use, divergences and agreement with labels
-    of its options.
+    paired difference to every baseline. A hierarchy also has its options' use, divergences and agreement.
 
     :param parts: training (``train``) and held-out (``valid``) demonstrations.
     :param contained: names of the mixtures among the baselines that the model contains.
@@ -281,8 +278,7 @@ CONSTANT: Mapping[str, Any] = {
 
 
 def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Marginal | None:
-    """The density of the control without observations, of the same kinds, fitted to the demonstrations that
-    train.
+    """The density of the control without observations, of the same kinds, fitted to those that train.
 
     :param parts: as of :func:`evaluate`.
     :returns: None where no demonstration is held out.
@@ -350,8 +346,7 @@ def _worst_first(
 
 
 def _by_dimension(fit: Fit, part: _Part, demos: Demonstrations) -> Dimensions:
-    """The contributions of each control dimension, and of the choice of options, to the log-likelihood per
-    step.
+    """The contributions of each control dimension, and of options, to the log-likelihood per step.
 
     Constant dimensions, which the model leaves out, have None.
     """

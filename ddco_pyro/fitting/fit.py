@@ -255,8 +255,7 @@ def fit_beside(
     It is without demonstrations, which another process need not send back.
 
     :param name: of the model in events.
-    :param folder: two below the folder of the run or selection, which has a digest of the same
-        demonstrations.
+    :param folder: two below that of the run or selection, which has a digest of the same demonstrations.
     """
     if folder:
         claim(folder, spec)
@@ -287,8 +286,7 @@ def repeat(first: Fit, seeds: int, on_event: OnEvent = ignore, jobs: int = 1) ->
 
     Each repetition is a run in ``seeds/SEED`` of the run folder; a finished one is not done again.
 
-    :param jobs: processes that fit side by side; -1 is one for each core. The result is the same for any
-        number.
+    :param jobs: processes that fit side by side; -1 is one for each core. Any number gives the same result.
     :returns: the fit, with the results of all repetitions in ``metrics.seeds`` and ``metrics.json``.
     :raises Failed: a process died.
     """

@@ -203,8 +203,7 @@ class Fit:
         return bool(np.isclose(known, log_likelihood, rtol=TOLERANCE, atol=TOLERANCE))
 
     def infer(self, demos: Iterable[Demonstration], held_out: bool = False) -> Iterator[Inferred]:
-        """The model's outputs, posteriors and paths for demonstrations, in pieces that fit into memory, in
-        order.
+        """The model's outputs, posteriors and paths for demonstrations in order, in pieces that fit memory.
 
         >>> for piece in fit.infer(demos):
         ...     print(piece.log_likelihood.shape, piece.posterior.u[0].shape, piece.path.choices[0].shape)
@@ -328,8 +327,7 @@ def load(folder: str | Path, allow_code: bool = False, overrides: Iterable[str] 
     :raises BadInput: the folder has no finished fit, or one of another format; or the model, or
         ``names.yaml``, is of another spec.
     :raises Damaged: the model or ``metrics.json`` is damaged.
-    :raises SpecError: its spec names user code, and that is not allowed; or an override is no setting of the
-        report.
+    :raises SpecError: its spec names user code unallowed, or an override is no setting of the report.
     """
     folder = path_of(folder, "folder")
     files = ("spec.yaml", "model.safetensors", "metrics.json")

@@ -100,8 +100,7 @@ def prior_of(spec: Spec, workers: Workers = Workers(1)) -> Prior | None:  # noqa
 
 
 def for_new_task(path: Path, run: Path, overrides: Iterable[str] = (), allow_code: bool = False) -> Spec:
-    """The spec of a library's run with what a file says of a new task, which trains on all demonstrations
-    there are.
+    """The spec of a library's run with what a file says of a new task, which trains on all demonstrations.
 
     :raises SpecError: the file or the run's spec cannot be read, or together they are no valid spec.
     """
@@ -128,13 +127,11 @@ def _leaves(data: Mapping[str, Any], place: str = "") -> Iterable[tuple[str, Any
 
 
 def _strength(library: Fit, spread: float, workers: Workers) -> float:
-    """The ridge with which a task that is left out is imitated best from one demonstration, kept with the
-    library.
+    """The ridge by which left-out tasks are imitated best from one demonstration, kept with the library.
 
     For each of :data:`MOST_TASKS` tasks the model is fitted without it, from the first of its starts. Each of
     :data:`STRENGTHS` then adapts that model to the task's first demonstration, and the controls of the others
-    are expected. Their error decides: the likelihood would judge σ, too, of which one demonstration says
-    little.
+    are expected. Their error decides: likelihood would judge σ, too, of which one demonstration says little.
 
     :raises BadInput: the demonstrations are of a single task.
     """

@@ -97,8 +97,7 @@ def matched(
 
     An option of a level with ``training.labels`` stands for its own label. Elsewhere options are matched with
     labels so that as many steps as possible agree (Hungarian assignment). An option then stands for its label
-    where more than half of its labelled steps have that label, and more than half of the label's steps are in
-    the option.
+    where more than half of its labelled steps have it, and more than half of the label's steps are in it.
 
     :param segments: the most likely choices of each level, of each demonstration [T].
     """
@@ -133,8 +132,7 @@ def matched(
 
 
 def accepted(spec: Spec, found: Sequence[NamedByLabel]) -> Named:
-    """The names with an agreement of :data:`AGREED` or more, and those that ``training.labels`` gives by
-    itself.
+    """The names with an agreement of :data:`AGREED` or more, and those that ``training.labels`` gives.
 
     Levels without any are left out.
     """

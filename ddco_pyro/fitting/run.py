@@ -41,8 +41,7 @@ def claimed(folder: Path, spec: Spec, resume: bool = True) -> Iterator[None]:
 
 
 def claim(folder: Path, spec: Spec, resume: bool = True) -> None:
-    """Make a folder the run of a spec, by writing ``spec.yaml``. An unfinished run of the same spec is
-    continued.
+    """Make a folder the run of a spec, by writing ``spec.yaml``. An unfinished run of it is continued.
 
     A spec that differs in its ``report`` alone is the same, and replaces the one in the folder.
 

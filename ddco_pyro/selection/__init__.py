@@ -1,5 +1,4 @@
-"""Selection by k-fold cross-validation (paper §4.3) over a grid of spec keys, with the same folds for every
-candidate.
+"""Selection by k-fold cross-validation (paper §4.3) over a grid of spec keys, with the same folds for all.
 
 The folder holds ``selection.json`` (the result), ``folds/`` (the run folder of each candidate's fit without a
 fold), ``fit/`` (the final fit) and ``demonstrations.json`` (the digest of the demonstrations).
@@ -49,8 +48,7 @@ ALL_CORES = Workers()
 
 @dataclass(frozen=True)
 class Selection:
-    """A finished cross-validation, its folder, and the demonstrations with the observations of every
-    candidate.
+    """A finished cross-validation, its folder, and demonstrations with the observations of every candidate.
 
     :param held_out: the names of the demonstrations that each fold holds out.
     """
@@ -92,8 +90,7 @@ def select(
     demos: Demonstrations | None = None,
     resume: bool = True,
 ) -> Selection:
-    """Score every candidate of the spec's grid in every fold, choose one, and write table and figure into the
-    folder.
+    """Score every candidate of the spec's grid in every fold, choose one, and write table and figure.
 
     Fits that the folder holds are not done again. The result depends on the spec and the demonstrations
     alone, not on workers or interruptions.
@@ -159,8 +156,7 @@ def _fit_all(
 
 
 def _fitted(spec: Spec, demos: Demonstrations, folder: Path) -> Metrics | str:
-    """The metrics of a fit to a fold's demonstrations, on one thread for the same bits anywhere; or why it
-    failed.
+    """The metrics of a fit to a fold's demonstrations, on one thread for equal bits; or why it failed.
 
     A failure does not stop other folds.
     """

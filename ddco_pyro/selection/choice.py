@@ -108,8 +108,7 @@ class Choice:
         return [*self._rising(), *([STD_NOTE] if any(std != stds[0] for std in stds) else [])]
 
     def _rising(self) -> Iterator[str]:
-        """Of each number in the grid whose best value is the largest or the smallest: there may be better
-        ones beyond.
+        """Of each number in the grid with the best value at an end: there may be better ones beyond.
 
         A single option has nothing below.
         """
@@ -131,8 +130,7 @@ class Choice:
 def choose(candidates: Sequence[Candidate], fits: Mapping[tuple[int, int], Metrics | str]) -> Choice:
     """The best candidate, and the candidate that the one-standard-error rule chooses.
 
-    :param fits: by the number of the candidate and of the fold, which is complete: metrics, or why there are
-        none.
+    :param fits: by the number of the candidate and of the fold, all of it: metrics, or why there are none.
     """
     rows = []
     for candidate in candidates:
@@ -224,8 +222,7 @@ def markdown(choice: Choice, data: Mapping[str, Any]) -> str:
 
 
 def write_figure(choice: Choice, path: Path) -> None:
-    """Draw log-likelihoods and paired differences of candidates as SVG; nothing where no candidate was
-    scored.
+    """Draw log-likelihoods and paired differences of candidates as SVG; nothing where none was scored.
 
     A band ends one standard error below the best.
     """

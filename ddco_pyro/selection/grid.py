@@ -135,8 +135,7 @@ def divide(demos: Demonstrations, folds: int, seed: int) -> tuple[Demonstrations
 
 
 def assign(tasks: Sequence[str], folds: int, seed: int) -> list[list[int]]:
-    """The numbers of the demonstrations held out in each fold: a partition, as even as possible, also of each
-    task.
+    """The numbers of the demonstrations held out in each fold: a partition, even within each task, too.
 
     :param tasks: of each demonstration.
     :raises BadInput: there are fewer demonstrations than folds, or too few to train and tune with.

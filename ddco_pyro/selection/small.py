@@ -1,8 +1,7 @@
 """What small fits decide of a spec: heavy tails, and what makes options last as long as is asked for.
 
 The less the control counts, the more a change of option costs beside what it explains. What gates and
-terminations read of the observations costs nothing, so where even a small power leaves segments too short,
-both become constant.
+terminations read costs nothing, so where even a small power leaves segments too short, both become constant.
 """
 
 from __future__ import annotations
@@ -178,8 +177,7 @@ def heavy_tails(spec: Spec, demos: Demonstrations) -> tuple[int, ...]:
 
 
 def moved(demos: Demonstrations) -> str:
-    """The vector that controls move most as a position, of three numbers or more, or else of two; empty
-    without one.
+    """The vector that controls move most as a position, of three numbers or more, else of two; or empty.
 
     Its value is the product of three shares: of its changes that controls explain, of its numbers that are
     drawn (the first three), and of the way of steady steps that the diagonal of the box around it is: 1 along
@@ -265,8 +263,7 @@ def unasked(tried: Callable[[float, bool], Lasting]) -> Lasting:
 
 
 def asked(tried: Callable[[float, bool], Lasting], steps: float) -> Lasting:
-    """The largest power whose median is about as long as is asked for: down in halves, then between the last
-    two.
+    """The largest power with a median about as long as asked for: down in halves, then between the last two.
 
     Too small a power makes segments short again, since options then hardly differ.
     """

@@ -23,8 +23,7 @@ class Episode:
 
     :param record: observations, intended controls and labels.
     :param outcome: the task's measures.
-    :param choices: the active option of each level, lowest first, [T, D]; D is 0 for other policies than
-        controllers.
+    :param choices: the active option of each level, lowest first, [T, D]; D is 0 for all but controllers.
     :param frames: pictures of the scene, uint8 [H, W, 3]: T + 1 where the episode was filmed, otherwise none.
     """
 
@@ -112,8 +111,7 @@ def _run_named(task: str, *how: Any) -> Episode:
 
 
 def summarize(task: Task, outcomes: Sequence[Mapping[str, float]]) -> dict[str, Measure]:
-    """Each measure over episodes: a rate with its Wilson 95 % interval, or a mean with Student's 95 %
-    interval.
+    """Each measure over episodes: a rate with Wilson's 95 % interval, a mean with Student's 95 % interval.
 
     Episodes to which a measure does not apply (NaN) are not among its ``trials``.
     """

@@ -21,8 +21,7 @@ class GymnasiumEnvironment(dm_env.Environment):
 
     ``gymnasium`` is the wrapped environment; ``success`` and ``total`` are the measures of the last episode.
 
-    :raises BadInput: the environment is not registered, its package cannot be imported, or a space has
-        another type.
+    :raises BadInput: there is no such environment, its package is not there, or a space has another type.
     """
 
     def __init__(self, id: str, seed: int, options: Mapping[str, Any]) -> None:

@@ -99,8 +99,7 @@ class Task:
 
         :param id: as in ``gymnasium.make``, such as ``"Pendulum-v1"`` or ``"module:Name-v0"``.
         :param policies: scripted policies; they find the Gymnasium environment as ``environment.gymnasium``.
-        :param options: further arguments of ``gymnasium.make``; ``render_mode="rgb_array"`` is needed for
-            films.
+        :param options: further ones of ``gymnasium.make``; films need ``render_mode="rgb_array"``.
         :raises BadInput: gymnasium or the environment's package cannot be imported, the environment is not
             registered, or a space has another type.
         """

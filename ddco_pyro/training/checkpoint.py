@@ -26,8 +26,7 @@ State = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What all restarts of a model share: demonstrations to train and to tune on, as they are encoded and
-    scaled.
+    """What all restarts of a model share: demonstrations to train and to tune on, encoded and scaled.
 
     :param names: of the training demonstrations.
     :param fitted: the state of the fitted encoder and scaling, and of a recogniser that labels train, by the
@@ -87,10 +86,8 @@ class Progress:
     :param stale: epochs since the best one.
     :param start: tuning log-likelihood per step before the current stage.
     :param best: the best tuning log-likelihood per step of the current stage.
-    :param objective: of the training demonstrations under the model that is kept, with the log-prior of its
-        weights, nats per step.
-    :param sounded: the same at the pause in which restarts are compared; of one that ended before it, at the
-        end.
+    :param objective: of training demonstrations under the kept model, with its log-prior, nats per step.
+    :param sounded: the same at the pause in which restarts are compared, or at the end if that came first.
     :param ended: a :class:`ddco_pyro.metrics.Stage` for each stage that has ended.
     :param history: a row for each epoch.
     :param device: the kind of device that its networks are trained on.

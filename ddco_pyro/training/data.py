@@ -35,8 +35,7 @@ def dimensions(spec: Spec, demos: Demonstrations | None = None) -> Dimensions:
     """The dimensions of the demonstrations that a spec names, without collecting any.
 
     They are read from the headers of the spec's file, or else from its task. A task whose episodes have no
-    fixed length counts as having one step. The control of a task is described where demonstrations have been
-    collected already.
+    fixed length counts as one step. A task's control is described where demonstrations are there already.
 
     :param demos: the demonstrations, where they have been read.
     """
@@ -93,8 +92,7 @@ def tuning_split(
 
 
 def refuse_unfit(spec: Spec, demos: Demonstrations) -> None:
-    """Refuse observations that networks cannot read, and a division that leaves too few demonstrations to
-    train with.
+    """Refuse observations that networks cannot read, and a division with too few demonstrations to train.
 
     :raises DemonstrationsError: one of both is the case.
     """
@@ -134,8 +132,7 @@ def demonstrations(spec: Spec, on_event: OnEvent = ignore) -> Demonstrations:
 
 
 def outline(spec: Spec) -> Demonstrations:
-    """The demonstrations in the spec's file, with zeros in place of observations, of which the headers alone
-    are read.
+    """The demonstrations in the spec's file, with zeros as observations, of which headers alone are read.
 
     The one that controls are relative to is read.
 
@@ -184,8 +181,7 @@ def _measured(spec: Spec) -> tuple[str, ...]:
 
 
 def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
-    """Demonstrations in memory, reduced to the observations and labels that a spec names, without the
-    excluded ones.
+    """Demonstrations in memory, without excluded ones, reduced to what a spec names to observe and label.
 
     :raises DemonstrationsError: an observation, a label or an excluded demonstration is missing.
     """
@@ -217,8 +213,7 @@ def seen(spec: Spec, demos: Demonstrations) -> Demonstrations:
 
 
 def _set_apart(spec: Spec, demos: Demonstrations) -> Demonstrations:
-    """The demonstrations with the mask ``valid`` that ``hold_out_by`` asks for, in place of masks of the
-    file.
+    """The demonstrations with the mask ``valid`` that ``hold_out_by`` asks for, in place of the file's own.
 
     They have the observation ``task`` where the spec names it, and labels of two tasks differ.
 

@@ -122,8 +122,7 @@ def joined(seen: Tensor, actions: Tensor) -> Tensor:
 
 
 def equal_parts(batch: Batch, options: int) -> Tensor:
-    """The part of each step in trajectories cut into ``options`` equal parts, [N, T], 1 to k; 0 where there
-    is padding.
+    """The part of each step in trajectories cut into ``options`` equal parts, [N, T], 1 to k; 0 for padding.
 
     Training of left-to-right hidden Markov models starts from this uniform segmentation.
     """

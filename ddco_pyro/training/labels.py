@@ -41,8 +41,7 @@ class Labels:
     def of(cls, spec: Spec, train: Demonstrations, tune: Demonstrations) -> Labels | None:
         """The labels that training uses; None where the spec names none.
 
-        :raises SpecError: the demonstrations to train with have no labels, or there are more labels than
-            options.
+        :raises SpecError: the demonstrations to train with lack labels, or have more labels than options.
         """
         labels = spec.training.labels
         if labels is None or spec.hierarchy is None:

@@ -1,5 +1,4 @@
-"""The training loop of one restart (paper §4.1, SM 2.2, SM 2.3): stages, epochs, gradient steps, early
-stopping.
+"""The training loop of one restart (paper §4.1, SM 2.2, SM 2.3): stages, epochs, steps, early stopping.
 
 The gradient of the marginal log-likelihood *is* the expectation-gradient step: the posteriors of the E-step
 weight the gradients of the networks. A gradient step sees a minibatch of whole trajectories.
@@ -105,12 +104,10 @@ def train(
 
 
 class StageTraining:
-    """A stage of a restart in training: the model, the objective, the optimiser, and the running mean of the
-    weights.
+    """A stage of a restart in training: model, objective, optimiser, and running mean of the weights.
 
     The stage begins, or goes on from the restart's checkpoint. Tuning demonstrations end it and choose its
-    epoch; EM before the last stage goes on until it converges instead, since a stage is a start for the next
-    one.
+    epoch; EM before the last stage goes on until it converges instead, since a stage starts the next one.
 
     :param last: whether it is the last stage of the restart.
     :ivar whole: steps over all demonstrations at once; None for gradient steps on minibatches.

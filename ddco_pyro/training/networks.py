@@ -112,8 +112,7 @@ def model_name(spec: Spec) -> str:
 
 
 def check_models(spec: Spec, dimensions: Dimensions) -> dict[str, tuple[Spec, Hierarchy]]:
-    """The specs and networks (:func:`check_networks`) of a spec's model and its baselines, by name, the model
-    first.
+    """The specs and networks (:func:`check_networks`) of a model, which is first, and its baselines, by name.
 
     :raises SpecError: as :func:`check_networks`.
     """

@@ -101,8 +101,7 @@ EVALUATIONS = 25
 
 
 class QuasiNewton:
-    """L-BFGS (Liu and Nocedal 1989) with a line search for the strong Wolfe conditions, over all
-    demonstrations.
+    """L-BFGS (Liu and Nocedal 1989) with a line search for strong Wolfe conditions, over all demonstrations.
 
     :param backward: adds the gradient of minus the log-likelihood per step; the log-likelihood, nats.
     :param decay: L2 penalty.

@@ -1,8 +1,7 @@
 """Processes and devices: ranks that train one restart together, and what makes work on a device repeatable.
 
 Ranks are started by ``torchrun`` and connected by ``torch.distributed``. All ranks come to the same exchanges
-in the same order. Results are passed on in the order of the calls that gave them, whichever rank computed
-them.
+in the same order. Results are passed on in the order of their calls, whichever rank computed them.
 """
 
 from __future__ import annotations

@@ -156,8 +156,7 @@ def _tried(
     """The candidates, each with its scores of the labelled steps that are left out.
 
     A model of the other labels decodes the left-out steps with each candidate. EM trains it on all
-    demonstrations, the left-out ones without their labels; a model that takes gradient steps is trained on
-    labelled ones alone.
+    demonstrations, the left-out ones unlabelled; gradient steps train a model on labelled ones alone.
     """
     assert data.labels is not None
     level, scores = data.labels.level, dict[tuple[float, float, float], list[tuple[float, float]]]()

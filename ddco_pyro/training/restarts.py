@@ -126,8 +126,7 @@ class Trainer:
         (:func:`follow`).
     :param library: the prior that the spec's ``training.library`` is.
     :raises DemonstrationsError: a number is too large for networks.
-    :raises SpecError: the demonstrations lack the labels that the spec names, or have more labels than
-        options.
+    :raises SpecError: the demonstrations lack the labels that the spec names, or have more than options.
     """
 
     def __init__(
@@ -175,8 +174,7 @@ class Trainer:
     def check_engines(self) -> None:
         """Compare the engines before any training, on a few of the training demonstrations.
 
-        EM's log-prior of a library is compared with that of the Pyro program, at random weights and at the
-        library's.
+        EM's log-prior of a library is compared with the Pyro program's, at random weights and the library's.
 
         :raises TrainingError: they disagree, or a network gives values that are not finite.
         """

@@ -32,8 +32,7 @@ class Stage:
     :param trained: prefixes of the names of the parameters that are trained.
     :param selecting: train the meta-policy on the clamped choices, beside the levels under a uniform one.
     :param from_constants: train the networks to :class:`ddco_pyro.training.upper.Constants`.
-    :param memoryless: every option ends after every step (ψ = 1); the networks of ψ start at ψ = 1/2 in later
-        stages.
+    :param memoryless: every option ends after every step (ψ = 1); later stages start networks of ψ at 1/2.
     """
 
     name: str

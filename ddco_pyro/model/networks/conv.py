@@ -30,8 +30,7 @@ POOLED = 8
 
 
 class Conv(Network):
-    """K networks of convolutions over each picture, pooled, and a perceptron over the pooled maps and the
-    vectors.
+    """K networks of convolutions over each picture, pooled, and a perceptron over pooled maps and vectors.
 
     :param layers: the convolutions.
     :param pool: ``mean`` of :data:`POOLED` × :data:`POOLED` fields of each map, ``flatten`` for the whole

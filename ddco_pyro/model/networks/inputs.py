@@ -23,8 +23,7 @@ class Frames:
     :param arrays: the pictures [T_n, ...] of each trajectory, in memory or in their file.
     :param transform: how they are cropped and scaled.
     :param steps: the T steps of time.
-    :param shifts: rows and columns by which the pictures of each trajectory are shifted, [N, 2]; None for
-        none.
+    :param shifts: rows and columns by which each trajectory's pictures are shifted, [N, 2]; or None.
     """
 
     arrays: tuple[Observed, ...]

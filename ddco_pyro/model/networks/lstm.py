@@ -28,8 +28,7 @@ class Lstm(Network):
 
     The state holds that of ``over``, then h and c [N, K, size] of each layer.
 
-    :param horizon: steps of a window; h and c are zeros again before the first step of each. None for no
-        windows.
+    :param horizon: steps of a window; h and c are zeros again before the first step of each. Or None.
     """
 
     def __init__(

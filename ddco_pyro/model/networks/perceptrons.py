@@ -68,8 +68,7 @@ class StackedLinear(nn.Module):
 
 
 class Perceptrons(nn.Sequential):
-    """K multi-layer perceptrons, with activation and dropout after every hidden layer; they give ``features``
-    numbers.
+    """K multi-layer perceptrons, with activation and dropout after hidden layers; ``features`` numbers each.
 
     Without hidden layers they give their inputs.
     """

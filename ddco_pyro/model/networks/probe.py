@@ -128,8 +128,7 @@ def _without_zeros(network: Network) -> Iterator[None]:
 
 
 def training_bytes(networks: Mapping[Network, InputShape]) -> int:
-    """Bytes that these networks, each with what it reads, take for a step while all of them are trained
-    together.
+    """Bytes that these networks, each with what it reads, take for a step while they are trained together.
 
     Each keeps tensors until its gradient is computed. While that happens, what one network computed and its
     gradient are there too: measured with convolutions, at most twice what the largest network keeps.

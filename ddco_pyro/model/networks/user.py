@@ -35,8 +35,7 @@ class UserNetwork(Network):
         """The network of the class ``name``, tried on random observations.
 
         :param outputs: None for a trunk, whose class says their number as ``features``.
-        :raises ShapeError: the class cannot be imported or made, or its network is refused by
-            :func:`try_network`.
+        :raises ShapeError: the class cannot be imported or made, or :func:`try_network` refuses it.
         """
         network_class = _imported(name)
         outputs = getattr(network_class, "features", FEATURES) if outputs is None else outputs
