@@ -40,11 +40,9 @@ def side_by_side(
     clock: Callable[[], float] = time.process_time,
     warm: bool = True,
 ) -> Row:
-    """The least times of both calls in turns, after each has run once. ``warm`` says whether the first needs
-    that.
+    """The least times of both calls in turns, after each ran once if ``warm``, as the first may need.
 
-    A turn repeats a short call for :data:`TURN` seconds. Other processes only add to a time, so minima are
-    compared.
+    A turn repeats a short call for :data:`TURN` seconds. Others only add to times: minima are compared.
     """
     if warm:
         first()

@@ -120,8 +120,7 @@ def plain_hmm(number: int, steps: int, options: int = 5, controls: int = 3) -> t
 
 
 def em_steps(hierarchy: Hierarchy, batch: Batch) -> tuple[Callable[[], object], Callable[[], object]]:
-    """An iteration of EM of linear options, and one of dynamax's for an HMM with linear regressions as
-    emissions.
+    """An iteration of EM of linear options, and one of dynamax's for an HMM with linear regressions.
 
     Ours learns terminations and a meta-policy that see the state, dynamax's a matrix of transitions.
     """

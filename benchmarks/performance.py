@@ -307,8 +307,7 @@ ALONE = {"control.power": 1.0, "training.optimizer.ridge": {"policy": 0.0, "gate
 
 
 def em() -> Iterator[Row]:
-    """EM until the training likelihood of Adam's whole training, processor time; and a step of EM beside
-    dynamax's.
+    """EM until the training likelihood of Adam's whole training, processor time; and a step beside dynamax's.
 
     Both maximise the likelihood alone: ``init``'s ridges and its power are for held-out demonstrations.
     """

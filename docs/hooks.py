@@ -1,5 +1,4 @@
-"""What the site is made of beside the pages: references generated from the code, equations, and commands that
-were run.
+"""What the site is made of beside the pages: references from the code, equations, and commands that were run.
 
 - ``spec.md`` comes from the spec's schema, ``cli.md`` from the command line itself.
 - ``$...$`` and ``$$...$$`` become MathML, which browsers show without a script.

@@ -1,5 +1,4 @@
-"""Whether this machine can draw the camera's pictures: ``python3 tasks/opengl.py``, before anything is
-installed.
+"""Whether this machine can draw the camera's pictures, before an installation: ``python3 tasks/opengl.py``.
 
 Ends with 0, or with 1 and a line that says what is missing and how to get it. Does with the system's
 libraries what dm-control's renderers do first, through ``ctypes`` alone.

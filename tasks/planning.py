@@ -49,8 +49,7 @@ def plan_path(
     is_free: Callable[[np.ndarray], bool],
     settings: Settings = DEFAULT,
 ) -> np.ndarray:
-    """The corners [K, J] of a short path from ``start`` [J] to ``goal`` [J] through joints where ``is_free``
-    holds.
+    """Corners [K, J] of a short path from ``start`` [J] to ``goal`` [J] through free joints (``is_free``).
 
     :param ranges: the joints' limits [J, 2].
     :raises NoPath: when an end is not free, or the planner gives up.
@@ -99,8 +98,7 @@ def _simplify(path: geometric.PathGeometric, information: base.SpaceInformation,
 def _restart_random_numbers() -> None:
     """Let every generator made from here on start as in a new process.
 
-    OMPL calls it an error to do this twice, since generators that exist already keep their state. None is
-    kept here.
+    OMPL calls it an error to do this twice, since generators keep their state. None is kept here.
     """
     level = util.getLogLevel()
     util.setLogLevel(util.LOG_NONE)

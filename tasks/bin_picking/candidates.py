@@ -1,5 +1,4 @@
-"""Grasp candidates in a mask: points on what is seen, each with a direction, and a classifier that scores
-them.
+"""Grasp candidates in a mask: points on what is seen, each with a direction, and a classifier of them.
 
 The classifier is a logistic regression over how the mask looks in the frame of the gripper, so its weights
 are a few numbers. ``grasp_classifier.json`` holds them; ``studies/bin_picking_candidates.py`` of commit

@@ -26,8 +26,7 @@ JAW = "jaw"
 
 @dataclass(frozen=True)
 class Controls:
-    """A form of controls [A]: numbers [A - 1] that say what the encoders of the joints are to read, and the
-    jaw.
+    """A form of controls [A]: numbers [A - 1] that the encoders of the joints are to read, and the jaw.
 
     :param names: of the numbers.
     :param ranges: least and greatest of each, [A - 1, 2].

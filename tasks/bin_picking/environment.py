@@ -196,8 +196,7 @@ def frame(environment: dm_env.Environment) -> np.ndarray:
 def load(
     seed: int, instrument: int = 1, controls: Controls = JOINTS, kinds: Sequence[str] | None = None
 ) -> Environment:
-    """A fresh environment whose objects and episodes depend on the seed alone, with the instrument of that
-    number.
+    """A fresh environment with objects and episodes by the seed alone, with the instrument of that number.
 
     :param kinds: of the objects; drawn where they are not given.
     """

@@ -1,5 +1,4 @@
-"""Where things are: bin, cups, the places of a trial's way points, and the pixels of the overhead stereo
-pair.
+"""Where things are: bin, cups, places of a trial's way points, and pixels of the overhead stereo pair.
 
 Metres and radians; pixels are counted from the centre of the upper left one. The world's origin is on the
 bin's floor, between the cups; x points towards the reject cup, y away from the arm.

@@ -41,8 +41,7 @@ class Instrument:
         return psm.encoder_readings(joints - self.bias) + slack
 
     def command(self, joints: np.ndarray, motors: np.ndarray, slack: np.ndarray) -> np.ndarray:
-        """The motors' set points [6] that bring the joints to ``joints`` [6] from ``motors`` and ``slack``
-        [6].
+        """The motors' set points [6] that bring joints to ``joints`` [6] from ``motors`` and ``slack`` [6].
 
         A motor has to run ahead of its joint in the direction in which the joint is to move; where the joint
         is to stay the motor does.

@@ -1,5 +1,4 @@
-"""What lies in the bin: dissection pins, suturing needles and wires; and four kinds that no demonstration has
-shown.
+"""What lies in the bin: dissection pins, suturing needles and wires; and four kinds never demonstrated.
 
 All but the thread are rigid chains of capsules and cylinders. The thread is a chain of links with joints
 between them, which keep the shape it has on the spool, but softly. An object's frame has its origin in the

@@ -26,8 +26,7 @@ def load_of(left: np.ndarray) -> np.ndarray:
 
 
 def described(mask: np.ndarray) -> np.ndarray:
-    """The shape of what is not 0 in a mask uint8 [H, W]: numbers [18] in pixels (:data:`NAMES`), 0 where
-    hardly any is.
+    """The shape of what is not 0 in a mask uint8 [H, W]: numbers [18] in pixels (:data:`NAMES`), 0 for few.
 
     Its pixels, those that have neighbours above, to the left and between, how many parts it has, and the
     pixels of the largest; standard deviations along its principal axes; the area of its convex hull, the

@@ -37,8 +37,7 @@ def arc_tangent(coordinate: float) -> np.ndarray:
 
 
 def lying_needle(features: np.ndarray) -> Pose:
-    """The pose of a needle that lies on the mat, from its ellipse [6] (mm; see
-    :func:`ddco_tasks.vision.ellipse`).
+    """The pose of a needle on the mat, from its ellipse [6] (mm; :func:`ddco_tasks.vision.ellipse`).
 
     An ellipse looks the same after half a turn: of the two headings, the one nearer to the phantom is taken.
     """

@@ -1,5 +1,4 @@
-"""Planar pushing: a 3-link arm pushes a box along a surface to goals on its left and right without toppling
-it.
+"""Planar pushing: a 3-link arm pushes a box along a surface to goals left and right without toppling it.
 
 After the paper's simulation (§5.1, SM 1.1), in MuJoCo instead of Box2D: links of 5, 5 and 3 units (0.1 m
 each) in the vertical plane, controlled by joint velocities; a box with friction and gravity; as many goals as
@@ -65,8 +64,7 @@ class Pushing(base.Task):
     """Starts, observes and rewards an episode.
 
     :param goal_steps: steps after which a goal is missed, and box and goal are drawn anew; None for no limit.
-    :param single: the episode is about one goal: it ends when that is reached or missed, or the box has to be
-        put back.
+    :param single: the episode is about one goal, until that is reached or missed, or the box is put back.
     """
 
     def __init__(

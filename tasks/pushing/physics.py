@@ -34,8 +34,7 @@ class Physics(mujoco.Physics):
         self._from, self._to = self._to, np.array(velocities, float)
 
     def step(self, nstep: int = 1) -> None:
-        """One control step of ``nstep`` time steps, a multiple of 5: the servos ramp to the velocities that
-        were set.
+        """One control step of ``nstep`` time steps, a multiple of 5: the servos ramp to the set velocities.
 
         Servos of unequal inertia that were given a step would for a moment send the tip somewhere else, fast
         enough to kick the box away.

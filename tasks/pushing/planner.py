@@ -1,5 +1,4 @@
-"""The planning supervisor's mind: RRT-Connect round the box to a place behind it, then along a band of tip
-heights.
+"""The planning supervisor's mind: RRT-Connect round the box to behind it, then along a band of tip heights.
 
 After the paper's supervisor (§5.1, SM 1.1), whose one parameter is the longest branch of the tree, 0.1. A
 plan is made a function of the state, so that it can be imitated: the planner starts from the same random

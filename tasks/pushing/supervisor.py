@@ -1,5 +1,4 @@
-"""Scripted policies of the pushing task: way points by rule, and plans by RRT-Connect. Both see what a
-learner can see.
+"""Scripted policies of pushing: way points by rule, plans by RRT-Connect. Both see what a learner can see.
 
 Any of them can be recorded with a disturbed hand: its moves are inexact while its intentions are recorded, so
 that demonstrations show how to come back from an inexact move without teaching the inexactness.

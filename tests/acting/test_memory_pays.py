@@ -1,5 +1,4 @@
-"""Where the next skill is hidden from what is seen, options that last succeed and a memoryless mixture does
-not.
+"""Where the next skill is hidden from what is seen, options that last succeed and a mixture does not.
 
 The supervisor moves one way or the other on a line, 1 or -1: this is its *intention*, which the observation
 ``seen`` does not tell. In the control case the observation ``intention`` tells it, and the two are equal.

@@ -22,8 +22,7 @@ WINDOWS = {"network": "lstm", "horizon": 4}
     [((3,), "mlp"), ((2, 2), "mlp"), ((2, 2), "lstm"), pytest.param((2, 2), WINDOWS, id="windows")],
 )
 def test_what_it_says_at_the_end_is_what_the_demonstration_says(counts, network):
-    """Before the last control is known, the belief is the posterior of the demonstration without that
-    control.
+    """Before the last control is known, the belief is the posterior of the demonstration without it.
 
     An episode that was broken off before is forgotten.
     """

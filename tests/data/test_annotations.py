@@ -15,8 +15,7 @@ from ddco_pyro.errors import BadInput
 
 
 def labels(lengths, path, known=None, **said):
-    """Names of labels by label name; the name of each step by demonstration, empty where nothing is said;
-    notes.
+    """Names of labels by label name; names of each step by demonstration, empty where nothing is said; notes.
 
     :param lengths: steps of each demonstration by its name.
     :param known: the names of labels that the source has.

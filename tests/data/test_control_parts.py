@@ -15,8 +15,7 @@ from ddco_pyro.spec import ControlSpec, SpecError, dump_spec, with_overrides
 
 
 def mixed(seed=0, steps=30):
-    """[T, 5]: free, at bounds ±2 and within, a switch between 0.1 and 0.7, at its upper bound alone,
-    constant.
+    """[T, 5]: free, at bounds ±2 and within, a switch between 0.1 and 0.7, at its upper bound, constant.
 
     The constant is no float32.
     """
@@ -260,8 +259,7 @@ def test_different_measures_are_not_ranked(fitted, tmp_path):
 
 
 def no_ops(number=8, steps=30, dimensions=3, at_once=True):
-    """A teleoperator who rests, without any skill: in half of the steps the control is exactly 0, else it is
-    normal.
+    """A teleoperator who rests, without skill: in half of the steps the control is exactly 0, or else normal.
 
     :param at_once: in all dimensions at once; else in each by itself.
     """

@@ -35,8 +35,7 @@ STATE, NOISE = 0.2, 0.05
 def four_tasks(number: int = 10, seed: int = 0) -> Demonstrations:
     """Four planted tasks with three options of their own each: in each, phases are numbers from 0 to 2.
 
-    Each option has a place of its own on a circle, and the control is the way there from a state that
-    wanders.
+    Each option has its own place on a circle, and the control is the way there from a state that wanders.
 
     A demonstration has three segments of 6 to 9 steps, one of each option of its task.
     """

@@ -77,8 +77,7 @@ def test_dimensions_with_other_sigmas_stand_beside():
 
 
 def noisy(number=40, steps=25):
-    """Controls around a linear policy, with a spread of 0.05 + softplus(2.5 s_0 - 1); and their
-    log-densities.
+    """Controls around a linear policy, with a spread of 0.05 + softplus(2.5 s_0 - 1); their log-densities.
 
     One policy does all of it: there is no skill.
     """

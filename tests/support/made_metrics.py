@@ -58,8 +58,7 @@ def made_metrics(held_out: int = 1, **fields: Any) -> Metrics:
 def scored(
     train: dict[str, float], valid: dict[str, list[float]], marginal: float, controls: int, **more: Any
 ) -> Metrics:
-    """Metrics of models with these log-likelihoods of held-out demonstrations of one step, the run's model
-    first.
+    """Metrics of models with these log-likelihoods of held-out demonstrations of one step, the run's first.
 
     :param marginal: of the density without observations on held-out demonstrations, nats per step.
     """

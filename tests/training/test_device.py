@@ -1,5 +1,4 @@
-"""Networks on a device, everything else on the host; the same fit wherever that is, and a clear line where it
-is not.
+"""Networks on a device, all else on the host; the same fit wherever that is, or a line where it is not.
 
 Without a GPU a double stands for one: it computes here, and refuses what a GPU would refuse.
 """

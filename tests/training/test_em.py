@@ -127,11 +127,9 @@ def test_steps_never_lower_the_penalised_likelihood_and_end_where_its_gradient_i
 
 
 def baum_welch(weights, start, ends):
-    """Initial and later choices and ends of an HMM, as numpy's forward-backward expects them of log-densities
-    [T, K].
+    """Initial and later choices and ends of an HMM, as numpy's forward-backward expects them, with [T, K].
 
-    An option that ends may be selected again: A = diag(1 - ψ) + ψ η^T, and η is also the distribution of the
-    first.
+    An option that ends may be selected again: A = diag(1 - ψ) + ψ η^T; η is also that of the first.
     """
     stay, switch = np.diag(1 - ends), np.outer(ends, start)
     selected, ended, active, total = np.zeros_like(start), np.zeros_like(ends), np.zeros_like(ends), 0.0
@@ -379,8 +377,7 @@ def bimanual(number=20, steps=60, seed=0):
 
 
 def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(tmp_path):
-    """As ``init`` writes it, a fit to two arms is far better held out; where demonstrations are many, nothing
-    changes.
+    """As ``init`` writes it, a fit to two arms is far better held out; with many it is the same.
 
     By the spec's own ridge the same fit falls apart, and says so.
     """

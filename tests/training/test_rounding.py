@@ -1,8 +1,6 @@
-"""Observations that vary by rounding alone: `inspect` says so, `init` leaves them out, and no encoder makes
-them loud.
+"""Observations that vary by rounding: `inspect` says so, `init` leaves them out, no encoder makes them loud.
 
-What rests is planted: a simulator's quaternion of an object that never turns, whose components are 1e-6
-apart.
+What rests is planted: a simulator's quaternion of an object that never turns, with components 1e-6 apart.
 """
 
 import json
