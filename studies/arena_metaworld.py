@@ -10,12 +10,12 @@ it has none. ``play`` lets exported controllers act from the same initial states
 
 from __future__ import annotations
 
+import argparse
 import copy
 import functools
 import os
 import sys
 import warnings
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -96,25 +96,18 @@ def demonstrate(world: Sawyer, expert: Any, phases: Phases, seed: int, noise: fl
     return None if left is None else steps
 
 
-def collect(
-    task: str,
-    out: Path,
-    number: int,
-    held_out: int,
-    noise: float,
-    first: int = 0,
-    attempts: int | None = None,
-) -> None:
+def collect(own: argparse.Namespace) -> None:
     """Record the first successful episodes from seed ``first`` on."""
-    world, expert = Sawyer(task), ENV_POLICY_MAP[task]()
+    world, expert = Sawyer(own.task), ENV_POLICY_MAP[own.task]()
     places = getattr(type(expert), "_desired_pos", None)
     phases = Phases(places) if places else Phases(type(expert).get_action, "delta_pos")
 
     def demonstration(seed: int) -> Recorded | None:
-        steps = demonstrate(world, expert, phases, seed, noise)
+        steps = demonstrate(world, expert, phases, seed, own.noise)
         return steps and recorded(steps)
 
-    arena_recording.collect(out, f"metaworld/{task}", demonstration, number, held_out, first, attempts)
+    asked = (own.number, own.held_out, own.first or 0, own.attempts)
+    arena_recording.collect(own.out, f"metaworld/{own.task}", demonstration, *asked)
 
 
 def recorded(steps: list[Step]) -> Recorded:
@@ -139,7 +132,7 @@ def main() -> None:
         print(f"there is no task {own.task!r}; Meta-World has: {known}", file=sys.stderr)
         raise SystemExit(2)
     if own.what == "collect":
-        collect(own.task, own.out, own.number, own.held_out, own.noise, own.first or 0, own.attempts)
+        collect(own)
     else:
         first = UNSEEN if own.first is None else own.first
         seeds = range(first, first + own.episodes)

@@ -32,11 +32,9 @@ class Phases:
         if not returns:
             raise ValueError(f"{function.__qualname__} has no {kind}")
         self.lines = [first + start - 1 for start, _ in returns]
-        self._phase = {
-            first + line - 1: number
-            for number, (start, end) in enumerate(returns)
-            for line in range(start, end + 1)
-        }
+        self._phase: dict[int, int] = {}
+        for number, (start, end) in enumerate(returns):
+            self._phase |= dict.fromkeys(range(first + start - 1, first + end), number)
         self._last: int | None = None
 
     def of(self, call: Callable[..., Any], *arguments: Any) -> tuple[Any, int]:

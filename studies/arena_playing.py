@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -120,9 +120,7 @@ def play(controller: Any, environment: Environment, seed: int) -> dict[str, Any]
     return {"success": success, "steps": steps, **environment.outcome}
 
 
-def play_all(
-    environment: Environment, out: Path, controllers: Mapping[str, Any], seeds: Sequence[int]
-) -> None:
+def play_all(environment: Environment, out: Path, controllers: Mapping[str, Any], seeds: range) -> None:
     """Episodes of each controller, as JSON."""
     played = {name: [play(one, environment, seed) for seed in seeds] for name, one in controllers.items()}
     out.write_text(json.dumps({"episodes": played}))

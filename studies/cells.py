@@ -93,9 +93,7 @@ def do(
         return ""
 
 
-def do_all(
-    calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, on_event: OnEvent = ignore
-) -> None:
+def do_all(calls: Mapping[str, Callable[[], str]], kept: int, workers: Workers, on_event: OnEvent) -> None:
     """Make the calls of :func:`do`, by the name of the cell; ``kept`` other cells are done already."""
     on_event(CellsBegan("study", len(calls) + kept, kept))
     with run_all(calls, workers, "did a cell") as done:

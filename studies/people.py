@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -247,11 +247,7 @@ def recognised(piece: Any) -> Iterator[tuple[Any, int]]:
     return zip(piece.recognised, piece.lengths, strict=True)
 
 
-Rows = Sequence[np.ndarray]
-"""A value of each step, of each demonstration."""
-
-
-def matched(kinds: Rows, truth: Rows) -> list[np.ndarray]:
+def matched(kinds: list[np.ndarray], truth: list[np.ndarray]) -> list[np.ndarray]:
     """Kinds as the labels that they are matched with, one for all demonstrations; -9 for none."""
     table = confusion(kinds, truth)
     pairs = zip(table.options, table.matched, strict=True)
@@ -259,7 +255,7 @@ def matched(kinds: Rows, truth: Rows) -> list[np.ndarray]:
     return [np.array([label.get(kind, -9) for kind in own.tolist()]) for own in kinds]
 
 
-def scored(named: Rows, kinds: Rows, truth: Rows) -> dict[str, float]:
+def scored(named: list[np.ndarray], kinds: list[np.ndarray], truth: list[np.ndarray]) -> dict[str, float]:
     """Over labelled steps: the share that is right, the mean edit score, the NMI, segments in a
     demonstration, and F1 of segments and of boundaries.
     """

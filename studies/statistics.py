@@ -137,10 +137,7 @@ def estimated(
     study: Study | None, table: pd.DataFrame, what: str, measure: str, counts: Sequence[str | int],
     task: str | None = None, times: float = 1.0,
 ) -> Estimate | None:  # fmt: skip
-    """The mean of a method or of a contrast, some times as large.
-
-    Rates of a study have the trials of their starts.
-    """
+    """The mean of a method or contrast, some times as large; a study's rates have their starts as trials."""
     own, starts = times * values(table, what, measure, counts, task), study and study.declared.starts
     trials = starts.test.count if starts and measure.startswith("success") and times == 1 else 0
     families, lowest = study.declared.families if study else {}, -1.0 if " - " in what else 0.0

@@ -77,10 +77,8 @@ SENTENCES: Mapping[tuple[str, Direction], str] = {
     ("marginal", "worse"): "{name} {predict} held-out controls worse than the mean and the spread of each "
     "control do: {valid} against {marginal} nats per step.",
     ("flat", "worse"): "{name} {are} below {other} by {by} nats per step on held-out demonstrations.",
-    (
-        "contained",
-        "worse",
-    ): "In training {name} {are} less likely than the {other} that they contain, by {by} nats per step.",
+    ("contained", "worse"): "In training {name} {are} less likely than the {other} that they contain, by "
+    "{by} nats per step.",
 }
 """Sentences by what was measured and in which direction; :data:`OVER` says over how many training seeds.
 {lead} is always options minus the mixture."""

@@ -288,15 +288,13 @@ def marginal(spec: Spec, size: Sizes, parts: Mapping[str, Demonstrations]) -> Ma
     own = {"control.std": spec.control.std} | {
         f"control.parts.{n}.std": p.std for n, p in enumerate(spec.control.parts)
     }
-    said = {path: std for path, std in own.items() if std}
-    stds = {
-        path: std if isinstance(std, LearnedStd) else LearnedStd(learn=True) for path, std in said.items()
-    }
-    learned = {path: {"learn": True, "floor": std.floor} for path, std in stds.items()}
+    learned = LearnedStd(learn=True)
+    stds = {path: std if isinstance(std, LearnedStd) else learned for path, std in own.items() if std}
+    changes = {path: {"learn": True, "floor": std.floor} for path, std in stds.items()}
     unseen = partial(_unseen, relative_to=spec.control.relative_to)
     train = unseen(tuning_split(spec, size, parts["train"])[0])
     alike = replace(size, shapes=train.observation_shapes, steps=max(train.lengths))  # of the same kinds
-    model = train_model(with_overrides(spec, {**CONSTANT, **learned}), alike, train).hierarchy
+    model = train_model(with_overrides(spec, {**CONSTANT, **changes}), alike, train).hierarchy
     values = {}
     for name, part in parts.items():
         total = sum(piece.log_likelihood.sum() for piece in infer(model, unseen(part)))

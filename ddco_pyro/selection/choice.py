@@ -176,9 +176,7 @@ def as_data(choice: Choice) -> dict[str, Any]:
                 "within_one_standard_error": within_one_error(row, choice.best),
                 "gradient_steps": row.gradient_steps,
                 "not_converged": len(row.unconverged),
-                "folds": [
-                    {"fold": fold, "log_likelihood_per_step": value} for fold, value in row.folds.items()
-                ],
+                "folds": [{"fold": n, "log_likelihood_per_step": value} for n, value in row.folds.items()],
             }
             for row in choice.rows
         ],

@@ -85,12 +85,7 @@ def collect(
 
 
 def _record(
-    task: Task,
-    task_name: str,
-    spec: DemonstrationsSpec,
-    path: Path,
-    on_event: OnEvent,
-    observed: Collection[str],
+    task: Task, name: str, spec: DemonstrationsSpec, path: Path, on_event: OnEvent, observed: Collection[str]
 ) -> None:
     at_once = EPISODES_WITH_PICTURES if task.seen_by_cameras(observed) else spec.count
     seeds = range(spec.seed, spec.seed + spec.count)
@@ -99,12 +94,12 @@ def _record(
     with robomimic_file(path, attributes, {}) as data:
         for first in range(0, len(seeds), at_once):
             some = seeds[first : first + at_once]
-            for episode in run_episodes(task_name, spec.supervisor, some, observed=observed):
+            for episode in run_episodes(name, spec.supervisor, some, observed=observed):
                 write_demonstration(data, episode.record)
                 outcomes.append(episode.outcome)
                 on_event(Counted("collecting demonstrations", spec.count, done=len(data)))
         attributes["supervisor"] = json.dumps(
-            {name: one.model_dump() for name, one in summarize(task, outcomes).items()}
+            {key: one.model_dump() for key, one in summarize(task, outcomes).items()}
         )
 
 

@@ -114,10 +114,9 @@ demo_0\t5.0\tleft\tgrasp\t\t\tSTATE\t6.000\t6.300\t0.300
 """
 
 
-WITH_COMMAS = "\ufeff" + AGGREGATED.replace("\t", ",")
-
-
-@pytest.mark.parametrize(("name", "text"), [("a.tsv", AGGREGATED), ("a.csv", WITH_COMMAS)])
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.tsv", AGGREGATED), ("a.csv", "\ufeff" + AGGREGATED.replace("\t", ","))]
+)
 def test_boris(tmp_path, name, text):
     (tmp_path / name).write_text(text, encoding="utf-8")
     names, found, notes = labels({"demo_0": 14, "demo_1": 2}, tmp_path / name)

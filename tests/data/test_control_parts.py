@@ -192,10 +192,8 @@ def run(request):
 
 
 MEASURES = {
-    "mixed": {
-        "0": ["gaussian"], "1": ["clipped", -2.0, 2.0], "2": ["binary", 0.1, 0.7],
-        "3": ["clipped", None, 1.0],
-    },
+    "mixed": {"0": ["gaussian"], "1": ["clipped", -2.0, 2.0], "2": ["binary", 0.1, 0.7],
+              "3": ["clipped", None, 1.0]},
     "rested": {
         "0": ["hurdle", -1.0, 1.0, 0.0, [0]], "1": ["hurdle", None, None, STILL, [1, 2]],
         "2": ["hurdle", None, None, 0.0, [1, 2]], "3": ["binary", 0.0, 1.0],

@@ -61,10 +61,9 @@ def test_the_base_of_a_mobile_robot_is_part_of_its_control(tmp_path: Path) -> No
         np.testing.assert_array_equal(demo.actions, np.hstack([odd.control(number), -odd.control(number)]))
 
 
-NAMED = [name for name, row in odd.ROWS.items() if row.says not in (None, odd.IMPORT)]
-
-
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize(
+    "name", [name for name, row in odd.ROWS.items() if row.says not in (None, odd.IMPORT)]
+)
 def test_what_is_not_read_is_named_with_a_remedy(name: str, tmp_path: Path) -> None:
     row = odd.ROWS[name]
     path = row.make(tmp_path)

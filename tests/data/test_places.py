@@ -34,10 +34,9 @@ def fails_on_a_full_disk(size: int, *command: object) -> None:
     assert says in ended.err.splitlines()[-1]
 
 
-SLOW = [pytest.param(size, marks=pytest.mark.slow) for size in (0, 60_000)]
-
-
-@pytest.mark.parametrize("size", [5000, *SLOW])
+@pytest.mark.parametrize(
+    "size", [5000, *(pytest.param(size, marks=pytest.mark.slow) for size in (0, 60_000))]
+)
 def test_a_full_disk_while_importing(tmp_path: Path, size: int) -> None:
     source, out = tmp_path / "source.hdf5", tmp_path / "out.hdf5"
     demonstrations(20).write(source)

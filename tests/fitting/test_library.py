@@ -125,10 +125,7 @@ WAYS, FILES = "control='average': has to be one of mean,", "demonstrations: has 
         (lambda fit: fit.draws(two_skills(), 2).boundaries("skill", 0, np.ones(8)), "no level 'skill'"),
         (lambda fit: fit.monitor().step(SEEN, np.zeros(2)), "no control comes before the first observation"),
         (lambda fit: ddco_pyro.fit(fit.spec, np.ones((8, 2))), "got ndarray"),
-        (
-            lambda fit: ddco_pyro.fit({"observations": []}, two_skills()),
-            "spec: has to be the path .*; got di",
-        ),
+        (lambda fit: ddco_pyro.fit({"observations": []}, two_skills()), "spec: has to be the path .*; got d"),
         (lambda fit: ddco_pyro.segment(fit, two_skills()), FILES),
         (lambda fit: Demonstration("a", np.ones(3), np.ones((3, 1))), "observations have to be a mapping"),
         (lambda fit: Demonstration("a", {"x": [[1], [1, 2]]}, np.ones((2, 1))), "a: obs/x is no array"),

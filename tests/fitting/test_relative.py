@@ -89,10 +89,7 @@ def test_its_export_gives_targets(fits: Fits, form: str, tmp_path: Path) -> None
 
 GRID = {"control.relative_to": "gripper", "selection.grid": {"control.relative_to": ["gripper", "jaw"]}}
 REFUSED = {
-    "unknown": (
-        {"control.relative_to": "griper"},
-        "control.relative_to: there is no observation 'griper' (d",
-    ),
+    "unknown": ({"control.relative_to": "griper"}, "control.relative_to: there is no observation 'griper'"),
     "in a grid": (
         GRID,
         "selection.grid.control.relative_to: decides what the control is, for all candidates",

@@ -132,10 +132,9 @@ def test_a_rate_has_its_wilson_interval(successes, trials):
     np.testing.assert_allclose(found.interval, [expected.low, expected.high], atol=1e-12)
 
 
-PAIRS = [(0, 0, 5), (6, 1, 3), (1, 6, 3), (4, 4, 0), (12, 0, 0)]
-
-
-@pytest.mark.parametrize(("only_ours", "only_theirs", "both"), PAIRS)
+@pytest.mark.parametrize(
+    ("only_ours", "only_theirs", "both"), [(0, 0, 5), (6, 1, 3), (1, 6, 3), (4, 4, 0), (12, 0, 0)]
+)
 def test_mcnemars_exact_p_value(only_ours, only_theirs, both):
     """Under equal chances the number of wins among the discordant pairs is binomial."""
     ours = [1.0] * only_ours + [0.0] * only_theirs + [1.0] * both + [0.0] * 2

@@ -107,10 +107,8 @@ def test_a_fold_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch):
 def test_where_nothing_is_left_an_unexpected_error_is_told_and_tried_again_next_time(tmp_path, monkeypatch):
     spec = spec_at(tmp_path, grid={"hierarchy.levels.0.count": [2]}, folds=2)
     monkeypatch.setattr(selection, "fit_beside", lambda *_, **__: 1 / 0)
-    said = (
-        "every candidate has failed in some fold; the first reason: unexpected ZeroDivisionError: division "
-    )
-    said += "by zero"
+    said = "every candidate has failed in some fold; the first reason: unexpected ZeroDivisionError: "
+    said += "division by zero"
     with pytest.raises(Failed, match=said):
         select(spec, tmp_path / "run", Told(), ONE)
     assert json.loads((tmp_path / "run" / "selection.json").read_text())["chosen"] is None

@@ -226,10 +226,9 @@ WRONG_NETWORKS = ({"network": "mpl"}, {"hidden": [0]}, {"hiden": [3]}, {"dropout
 WRONG = [{"hierarchy.levels.0.policy": network} for network in WRONG_NETWORKS]
 
 
-OTHERS = [{"hierarchy.levels.0.count": 0}, {"observation": ["pose"]}]
-
-
-@pytest.mark.parametrize("values", [*WRONG, *OTHERS], ids=str)
+@pytest.mark.parametrize(
+    "values", [*WRONG, {"hierarchy.levels.0.count": 0}, {"observation": ["pose"]}], ids=str
+)
 def test_the_schema_refuses_what_is_refused(values: dict[str, Any]) -> None:
     VALIDATOR.validate(SMALL)
     wrong = edited(SMALL, values)
@@ -328,10 +327,9 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-IDS = [message.partition(",")[0] for _, message in REFUSED]
-
-
-@pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=IDS)
+@pytest.mark.parametrize(
+    ("overrides", "message"), REFUSED, ids=[message.partition(",")[0] for _, message in REFUSED]
+)
 def test_refused_with_the_key_path_and_one_line(overrides: dict[str, Any], message: str) -> None:
     assert refusal(overrides).startswith(message)
 

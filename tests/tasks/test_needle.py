@@ -104,10 +104,9 @@ def test_reported_pose_is_where_the_encoders_were_sent(environment: Environment)
 # Vision.
 
 
-PLACES = [(-0.02, 0.0, -0.8), (-0.03, 0.015, -0.3), (-0.005, 0.01, -1.3)]
-
-
-@pytest.mark.parametrize(("x", "y", "heading"), PLACES)
+@pytest.mark.parametrize(
+    ("x", "y", "heading"), [(-0.02, 0.0, -0.8), (-0.03, 0.015, -0.3), (-0.005, 0.01, -1.3)]
+)
 def test_ellipse_is_where_the_needle_is(environment: Environment, x: float, y: float, heading: float) -> None:
     pose = lay(environment, x, y, heading, AWAY)
     angles = np.linspace(-geometry.ARC_HALF_ANGLE, geometry.ARC_HALF_ANGLE, 181)

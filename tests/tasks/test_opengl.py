@@ -58,10 +58,9 @@ def test_without_opengl_libraries_one_line_names_the_packages(cause: str, script
     assert f"apt-get install {PACKAGES}" in advice(cause)
 
 
-MACHINES = [{}, NO_DRIVER | {"MUJOCO_GL": "osmesa"}, NO_DRIVER | {"DISPLAY": ":0"}]
-
-
-@pytest.mark.parametrize("own", MACHINES, ids=str)
+@pytest.mark.parametrize(
+    "own", [{}, NO_DRIVER | {"MUJOCO_GL": "osmesa"}, NO_DRIVER | {"DISPLAY": ":0"}], ids=str
+)
 def test_where_the_tasks_can_draw_nothing_is_said(own: dict[str, str]) -> None:
     """Another renderer, or a display, is taken to work."""
     found = ended(sys.executable, "tasks/opengl.py", **own)

@@ -38,10 +38,9 @@ TINY = [
 ]
 
 
-OF_TASKS = [path for path in SPECS if path.stem not in OF_FILES]
-
-
-@pytest.mark.parametrize("path", OF_TASKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [path for path in SPECS if path.stem not in OF_FILES], ids=lambda path: path.stem
+)
 def test_specs_are_checked_against_their_tasks(path: Path) -> None:
     spec = load_spec(path, allow_code=True)
     known = dimensions(spec)

@@ -398,10 +398,9 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
     assert held.log_likelihood_per_step.valid > fallen.log_likelihood_per_step.valid + 50
 
 
-ALONE = [(1, None, 2.0), (6, None, 0.0), (6, ACTIONS[:1], 2.0)]
-
-
-@pytest.mark.parametrize(("number", "parts", "ridge"), ALONE)
+@pytest.mark.parametrize(
+    ("number", "parts", "ridge"), [(1, None, 2.0), (6, None, 0.0), (6, ACTIONS[:1], 2.0)]
+)
 def test_a_ridge_stays_where_nothing_can_be_left_out(number, parts, ridge):
     """Of a single demonstration, without a ridge, and where no control is continuous."""
     model, batch = linear((2,), parts), batch_for(parts)

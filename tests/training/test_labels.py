@@ -432,10 +432,9 @@ def test_a_run_says_for_which_labels_its_options_stand(files):
 # --- labels of several levels -------------------------------------------------------------------------------
 
 
-BOTH = [(["phase", "half"], ["phase", "half"]), ("half", ["half", "half"])]
-
-
-@pytest.mark.parametrize(("labels", "names"), BOTH)
+@pytest.mark.parametrize(
+    ("labels", "names"), [(["phase", "half"], ["phase", "half"]), ("half", ["half", "half"])]
+)
 def test_each_level_is_measured_with_its_own_labels(tmp_path, labels, names):
     random, phase = np.random.default_rng(0), np.repeat([0, 1, 2, 3], 4)
     own = {"phase": phase, "half": np.where(np.arange(16) == 8, -1, phase // 2)}

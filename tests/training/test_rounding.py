@@ -57,12 +57,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ([1.0, -5e-5], [1.0, 5e-5], "float32", [True, False]),  # a tenth of a millimetre, or of a milliradian
         # nothing large beside it: a signal in small units
         ([-6e-7, -1e-7], [6e-7, 1e-7], "float32", [False, False]),
-        (
-            [1e3, -1e-3],
-            [1e3, 1e-3],
-            "float64",
-            [True, False],
-        ),  # of mixed units: parts of 1 count, not of 1000
+        ([1e3, -1e-3], [1e3, 1e-3], "float64", [True, False]),  # mixed units: parts of 1, not of 1000
         ([5e6], [5e6 + 3], "float64", [False]),  # metres in a map's coordinates
         ([5e6], [5e6 + 1], "float32", [True]),  # two units in the last place
         ([1000], [1001], "int64", [False]),  # whole numbers are not rounded
