@@ -5,11 +5,10 @@
     python -m studies.ogbench_manipspace play TASK OUT.json NAME=EXPORTED... [--episodes 50] [--first 0]
 
 ``collect`` records OGBench's scripted Markov oracles as OGBench's "noisy" data sets were: an episode has
-several targets one after another, drawn by the environment, and normal noise on every control, whose level is
-drawn for each episode. An episode counts where every target was reached. Labels are OGBench's own: the
-``phase`` that the oracle announces, numbered over all oracles, and the ``object`` of the target. With
-``--goal 1`` the observation ``goal`` is where all objects are at the end of the episode, as OGBench
-represents goals to an oracle.
+several targets in turn, drawn by the environment, and normal noise on every control, whose level is drawn for
+each episode. An episode counts where every target was reached. Labels are OGBench's own: the ``phase`` that
+the oracle announces, numbered over all oracles, and the ``object`` of the target. With ``--goal 1`` the
+observation ``goal`` is where all objects are at the end of the episode, as OGBench's oracles have goals.
 
 ``play`` lets exported controllers reach OGBench's own five goals of the task, one after another by the seed.
 """

@@ -1,7 +1,6 @@
 """OGBench's manipulation tasks as worlds of a study: the goal is observed (``SHOWN``), or not (``HIDDEN``).
 
-The environment is made in ``runs/ogbench/venv`` from ``ogbench_requirements.txt``, and
-``ogbench_manipspace.py`` runs in it.
+Its environment ``runs/ogbench/venv`` is of ``ogbench_requirements.txt``; it runs ``ogbench_manipspace.py``.
 """
 
 from __future__ import annotations

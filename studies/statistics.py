@@ -111,10 +111,8 @@ def estimate(
     """The mean of values by task and seed, and its t interval.
 
     :param trials: of each fit, where the values are rates (``lowest`` 0) or their differences (-1). Equal
-        units have Wilson's interval of all trials, a difference that of as many trials with different
-        outcomes.
-    :param families: tasks by the name of their family, whose mean is one unit; tasks that are left out are
-        units.
+        units have Wilson's interval of all trials, a difference that of as many trials that differ.
+    :param families: tasks by the name of their family, whose mean is one unit; others are units.
     """
     of_task = {task: own.to_numpy().mean() for task, own in values.groupby(level=0, sort=False)}
     related = {task: family for family, tasks in (families or {}).items() for task in tasks}
@@ -184,8 +182,7 @@ def verdicts(
     """The verdict on each claim of a family, and its adjusted p-value.
 
     ``does not hold``: the contrary does, whose p-value is one minus that of the claim. ``inconclusive``:
-    neither does. ``not reached``: in a fixed sequence, a claim before it does not hold. ``not tested``: there
-    is no p-value.
+    neither does. ``not reached``: in a fixed sequence, an earlier claim does not. ``not tested``: no p-value.
 
     :param twins: maps an equivalence test to the superiority test of the same contrast. In a fixed sequence
         it is reached where its twin is, and no other claim waits for it.
