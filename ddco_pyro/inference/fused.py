@@ -11,13 +11,13 @@ from __future__ import annotations
 from functools import reduce
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddco_pyro.inference import kernel, logspace
 from ddco_pyro.inference.kernel import Structure
-from ddco_pyro.model.tables import Tables, complete
+from ddco_pyro.model.tables import Tables, by_step, by_trajectory, complete
 
 
 class Elimination(NamedTuple):
@@ -27,7 +27,7 @@ class Elimination(NamedTuple):
     :param value: log p(ξ), [N].
     :param tables: the posterior of each table's entries, in the tables' shapes; without evidence.
     :param marginals: of the choices of each level, [N, T, C_d]; empty where they are not wanted.
-    :param rows: tables and marginals side by side, [N, T, columns].
+    :param rows: tables and marginals one after the other, [columns, T, N].
     """
 
     value: Tensor
@@ -65,7 +65,7 @@ class Eliminate(torch.autograd.Function):
         leaves, needed = ctx.saved_tensors, ctx.needs_input_grad[4:]
         tables = Tables.of(ctx.depth, leaves)
         widest = reduce(torch.promote_types, (leaf.dtype for leaf in leaves if leaf is not None))
-        rows = ctx.rows.to(widest) * upstream.reshape(-1, 1, 1).to(widest)
+        rows = ctx.rows.to(widest) * upstream.to(widest)
         parts, marginals = _split(tables, rows, any(needed[3 * ctx.depth + 1 :]))
         each = *parts.leaves(), *(marginals or tables.evidence)
         gradients = (
@@ -94,36 +94,40 @@ def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elim
 def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool) -> Elimination:
     """The posteriors, or the derivatives of log p(ξ) with respect to the tables' entries."""
     with torch.no_grad():
-        number, steps = len(lengths), tables.steps
-        structure = Structure.of(tables.sizes)
+        structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.argsort(stable=True)
         gains = structure.columns + (sum(tables.sizes) if marginals else 0)
-        found = torch.empty(number, steps, gains, dtype=torch.float64)
-        value, exact = np.empty(number), np.empty(number, np.bool_)
-        order = lengths.argsort(stable=True)
-        blocks = torch.stack([lengths[block].sum() for block in order.split(kernel.LANES)])
 
-        def some(first: int, last: int) -> None:
-            chosen = order[first * kernel.LANES : last * kernel.LANES]
-            longest = int(lengths[chosen[-1]])
-            rows = side_by_side(tables.part(chosen, longest)).numpy()
-            room = kernel.room_for(longest, rows.shape[2], gains, structure.entries)
+        def some(first: int, last: int) -> tuple[Tensor, ...]:
+            chosen = order[first * lanes : last * lanes]
+            rows = rows_of(tables.part(chosen, tables.steps))
+            if len(chosen) < lanes:
+                rows = pad(rows, (0, lanes - len(chosen)))
+            number, steps, width = rows.shape
+            found = torch.empty(gains, steps, width, dtype=torch.float64)
+            value, exact = torch.empty(width, dtype=torch.float64), torch.empty(width, dtype=torch.bool)
             kernel.eliminate(
-                chosen.numpy(), lengths.numpy(), rows, found.numpy(), value, exact, room, tables.power, tables.logits,
-                gradient, structure.columns, *structure.tables, structure.groups, structure.inert,
+                pad(lengths[chosen], (0, width - len(chosen))).numpy(), rows.flatten().numpy(),
+                found.flatten().numpy(), value.numpy(), exact.numpy(),
+                kernel.room_for(steps, number, gains, structure.entries), tables.power, tables.logits, gradient,
+                number, gains, structure.columns, *structure.tables, structure.groups, structure.inert,
             )  # fmt: skip
+            return found, value, exact
 
-        kernel.on_threads(some, blocks)
-        elimination = Elimination(torch.from_numpy(value), *_split(tables, found, marginals), found)
-    for n in np.flatnonzero(~exact).tolist():
+        parts = zip(*kernel.on_threads(some, -(-len(order) // lanes), int(lengths.sum())), strict=True)
+        each = (part[0] if len(part) == 1 else torch.cat(part, -1) for part in parts)
+        place = slice(len(order)) if bool((order.diff() == 1).all()) else order.argsort()
+        found, value, exact = (part[..., place] for part in each)
+        elimination = Elimination(value, *_split(tables, found, marginals), found)
+    for n in (~exact).nonzero().flatten().tolist():
         _repeat_in_log_space(tables, n, int(lengths[n]), elimination, gradient)
     return elimination
 
 
-def side_by_side(tables: Tables) -> Tensor:
-    """The tables of all levels and the joint evidence as they are, float64 [N, T, columns]."""
+def rows_of(tables: Tables) -> Tensor:
+    """The tables of all levels and the joint evidence as they are, float64 [columns, T, N]."""
     evidence = tables.joint_evidence()
     each = [*_in_order(tables), *([] if evidence is None else [evidence])]
-    return torch.cat([table.detach().flatten(2) for table in each], -1).double()
+    return torch.cat([by_step(table.detach()).flatten(0, -3) for table in each]).double()
 
 
 def _in_order(tables: Tables) -> list[Tensor]:
@@ -135,14 +139,14 @@ def _split(tables: Tables, rows: Tensor, marginals: bool) -> tuple[Tables, tuple
     """Rows of posteriors as tables in the shapes of these ones, and the marginals of each level."""
     each = _in_order(tables)
     sizes = [*(table.shape[2:].numel() for table in each), *(tables.sizes if marginals else ())]
-    parts = rows.split(sizes, -1)
+    parts = [by_trajectory(part) for part in rows.split(sizes)]
     shaped = [part.unflatten(2, table.shape[2:]) for part, table in zip(parts, each, strict=False)]
     depth = tables.depth
     return (
         Tables(
             (*shaped[:depth],), (*shaped[depth : 2 * depth],), (*shaped[2 * depth + 1 :], shaped[2 * depth])
         ),
-        parts[len(each) :],
+        tuple(parts[len(each) :]),
     )
 
 

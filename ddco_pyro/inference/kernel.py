@@ -9,8 +9,8 @@ forward mass of the joint choices at t - 1. Above level 1 the row has the mass t
 below, at t. Row t of ``spread`` [T, M] has the mass that comes down again: the selected mass and the kept
 mass.
 
-Tables of all levels stand side by side in rows [N, T, columns]: selections, terminations, the meta-policy's
-control, the options' controls, and factors of the joint choices where there is evidence.
+Tables of all levels stand one after the other: selections, terminations, the meta-policy's control, the
+options' controls, and factors of the joint choices where there is evidence.
 
 All compiled functions are in this file, so that numba's cache, which looks at the file of an entry point, is
 right. Arrays are allocated by callers and indexed in full: numba takes seconds to compile allocations and
@@ -23,16 +23,16 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 import numpy as np
 import torch
 from llvmlite import ir
 from numba.extending import intrinsic
-from torch import Tensor
 
 Array = np.ndarray
+Result = TypeVar("Result")
 
 IMPOSSIBLE = -1
 """Marks a joint choice with an option below a choice 0, and a caller that is itself below a choice 0."""
@@ -128,24 +128,23 @@ def _offsets(sizes: Sequence[int]) -> Array:
     return np.cumsum([0, *sizes])
 
 
-def on_threads(run: Callable[[int, int], object], lengths: Tensor) -> None:
-    """Call ``run(first, last)`` for parts of the trajectories, on at most ``torch.get_num_threads()``
-    threads.
+def on_threads(run: Callable[[int, int], Result], number: int, steps: int) -> list[Result]:
+    """What ``run(first, last)`` returns for parts of ``number`` units of work, on at most
+    ``torch.get_num_threads()`` threads.
 
     torch itself works on one thread meanwhile: its own threads wait busily, and these would wait for them.
 
-    :param lengths: steps of each, [N].
+    :param steps: of all units.
     """
-    number, most = len(lengths), torch.get_num_threads()
-    threads = min(most, number, 1 + int(lengths.sum()) // STEPS_A_THREAD)
+    most = torch.get_num_threads()
+    threads = min(most, number, 1 + steps // STEPS_A_THREAD)
     if threads == 1:
-        run(0, number)
-        return
+        return [run(0, number)]
     bounds = [number * part // threads for part in range(threads + 1)]
     torch.set_num_threads(1)
     try:
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, bounds[:-1], bounds[1:]))
+            return list(pool.map(run, bounds[:-1], bounds[1:]))
     finally:
         torch.set_num_threads(most)
 
@@ -160,6 +159,7 @@ entry: Callable[[Callable[..., None]], Callable[..., None]] = (
 # --- trajectories side by side ------------------------------------------------------------------------------
 
 LANES = 8
+TOGETHER = 32
 """Trajectories side by side: numbers of one vector instruction."""
 
 ONE, ZERO, POWER, TOTAL, TERM, TOP, PRODUCT, FOUND, LEAST, WORST, FIXED = range(11)
@@ -186,6 +186,24 @@ def lanewise(compute: Callable[..., Any]) -> Callable[[Array, int, int, int], No
         return numba.void(room, numba.intp, numba.intp, numba.intp), generate
 
     return cast(Callable[[Array, int, int, int], None], over_lanes)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def move(typing: Any, into: Any, at: Any, source: Any, start: Any) -> Any:
+    """Compiled: copy :data:`LANES` numbers of a flat array to a place of another."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        vector = ir.VectorType(ir.DoubleType(), LANES).as_pointer()
+        places = [
+            builder.bitcast(
+                builder.gep(context.make_array(array)(context, builder, own).data, [place]), vector
+            )
+            for array, own, place in ((into, *arguments[:2]), (source, *arguments[2:]))
+        ]
+        builder.store(builder.load(places[1], align=8), places[0], align=8)
+        return context.get_dummy_value()
+
+    return numba.void(into, numba.intp, source, numba.intp), generate
 
 
 FUSED = ("contract",)
@@ -231,17 +249,17 @@ def _lower(room: Array, first: int, number: int) -> None:
 
 @inner
 def _load(
-    room: Array, p: int, t: int, block: int, order: Array, lengths: Array, rows: Array, logits: bool, powered: bool,
-    columns: int, groups: Array, inert: Array,
+    room: Array, p: int, t: int, steps: int, first: int, lengths: Array, rows: Array, logits: bool, powered: bool,
+    number: int, columns: int, groups: Array, inert: Array, stride: int,
 ) -> None:  # fmt: skip
     """Fill the probabilities at step t of a block. Past its end a trajectory keeps every choice."""
-    controls, number = groups[-1, 0], rows.shape[2]
+    controls = groups[-1, 0]
+    if t % TOGETHER == 0:
+        for c in range(number):
+            for u in range(min(TOGETHER, steps - t)):
+                move(room, LANES * (p + u * stride + c), rows, (c * steps + t + u) * len(lengths) + first)
     for lane in range(LANES):
-        at = block * LANES + lane
-        if at < len(order) and t < lengths[order[at]]:
-            for c in range(number):
-                room[LANES * (p + c) + lane] = rows[at, t, c]
-        else:
+        if t >= lengths[first + lane]:
             for c in range(number):
                 room[LANES * (p + c) + lane] = inert[c] if c < columns else 0.0
     for c in range(p + controls, p + columns if powered else 0):
@@ -349,8 +367,8 @@ def _backward(
 
 @entry
 def eliminate(
-    order: Array, lengths: Array, rows: Array, posterior: Array, value: Array, exact: Array, room: Array, power: float,
-    logits: bool, gradient: bool, columns: int, callers: Array, actors: Array,
+    lengths: Array, rows: Array, posterior: Array, value: Array, exact: Array, room: Array, power: float,
+    logits: bool, gradient: bool, number: int, gains: int, columns: int, callers: Array, actors: Array,
     choices: Array, above: Array, groups: Array, inert: Array,
 ) -> None:  # fmt: skip
     """Fill ``value``, ``exact`` and the posteriors, with :data:`LANES` trajectories in a block.
@@ -358,32 +376,34 @@ def eliminate(
     Each step is scaled to a mass of 1. Underflow there matters only where the past makes next to impossible
     what the future demands. Then Σ_s α_t(s) β_t(s) is not 1, and the trajectory is not ``exact``.
 
-    :param order: the trajectories [M] of N; those of a block should be about as long.
-    :param rows: their log-probabilities in this order; of selections and terminations logits where ``logits``
-        says so.
-    :param posterior: or the derivative of log p(ξ) with respect to ``rows``, where ``gradient`` says so.
+    :param lengths: of the trajectories, [N], at least :data:`LANES`; 0 where there is none. Those of a block
+        should be about as long. The last block has some of the block before again.
+    :param rows: ``number`` columns of log-probabilities, a flat [number, T, N]; of selections and
+        terminations logits where ``logits`` says so.
+    :param posterior: a flat [gains, T, N], or the derivative of log p(ξ) with respect to ``rows``, where
+        ``gradient`` says so.
     :param value: log p(ξ), [N]; ``exact`` likewise.
     :param room: of :func:`room_for`.
     """
-    number, size, gains = rows.shape[2], len(above) + 1, posterior.shape[2]
+    size, steps = len(above) + 1, len(rows) // (number * len(lengths))
     gain, begin, stride, controls = FIXED + size, FIXED + size + gains, number + 2 * size + 1, groups[-1, 0]
     for i in range(LANES):
         room[LANES * ONE + i], room[LANES * ZERO + i], room[LANES * POWER + i] = 1.0, 0.0, power
-    for block in range((len(order) + LANES - 1) // LANES):
-        longest, many = 0, min(LANES, len(order) - block * LANES)
-        for lane in range(many):
-            longest = max(longest, lengths[order[block * LANES + lane]])
+    for block in range((len(lengths) + LANES - 1) // LANES):
+        first, longest = min(block * LANES, len(lengths) - LANES), 0
+        for lane in range(LANES):
+            longest = max(longest, lengths[first + lane])
         multiply(room, FOUND, ZERO, ZERO)
         multiply(room, WORST, ZERO, ZERO)
         multiply(room, PRODUCT, ONE, ONE)
         multiply(room, LEAST, ONE, ONE)
-        for i in range(size):
-            multiply(
-                room, begin + number + i, ZERO if i < size - 1 else ONE, ONE
-            )  # at t = 0 everything is selected
+        for i in range(size):  # at t = 0 everything is selected
+            multiply(room, begin + number + i, ZERO if i < size - 1 else ONE, ONE)
         for t in range(longest):
             p = begin + t * stride
-            _load(room, p, t, block, order, lengths, rows, logits, power != 1.0, columns, groups, inert)
+            _load(
+                room, p, t, steps, first, lengths, rows, logits, power != 1.0, number, columns, groups, inert, stride
+            )  # fmt: skip
             _forward(room, p, number, columns, t, callers, actors)
             smallest(room, LEAST, LEAST, TOTAL)
             multiply(room, PRODUCT, PRODUCT, TOTAL)
@@ -407,12 +427,16 @@ def eliminate(
                     reduce(room, gain + c, TOTAL, p + c)
             for c in range(controls, columns if gradient else 0):
                 multiply(room, gain + c, gain + c, POWER)
-            for lane in range(many):
-                n = order[block * LANES + lane]
-                for c in range(gains if t < lengths[n] else 0):
-                    posterior[n, t, c] = room[LANES * (gain + c) + lane]
-        for lane in range(many):
-            n, most = order[block * LANES + lane], 0.0
+            for lane in range(LANES):
+                for c in range(gains if t >= lengths[first + lane] else 0):
+                    room[LANES * (gain + c) + lane] = 0.0
+            for c in range(gains):
+                move(posterior, (c * steps + t) * len(lengths) + first, room, LANES * (gain + c))
+        for t in range(longest, steps):
+            for c in range(gains):
+                move(posterior, (c * steps + t) * len(lengths) + first, room, LANES * ZERO)
+        for lane in range(LANES):
+            n, most = first + lane, 0.0
             for i in range(size):  # an overflow at t = 0 shows nowhere else
                 reached = room[LANES * (FIXED + i) + lane]
                 most = reached if not reached <= most else most  # NaN is not
@@ -421,9 +445,6 @@ def eliminate(
                 room[LANES * LEAST + lane] >= SMALL and room[LANES * WORST + lane] <= TOLERANCE * TOLERANCE
             )
             exact[n] = within and most <= LARGE and abs(value[n]) < np.inf
-            for t in range(lengths[n], posterior.shape[1]):
-                for c in range(gains):
-                    posterior[n, t, c] = 0.0
 
 
 def room_for(steps: int, columns: int, gains: int, entries: int) -> Array:
@@ -552,7 +573,7 @@ def trace(
 
     ``possible`` [N] says which trajectories have a probability above 0; others have no paths.
 
-    :param rows: log-probabilities.
+    :param rows: log-probabilities, [N, T, columns].
     :param uniforms: numbers uniform in [0, 1), [N, M, 1 + T, 2·D]; zeros for the most likely path.
     :param predicted: filled with the log-probabilities of joint choices before the control of each step, [N,
         T, S]; [N, 0, S] where they are not wanted.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ddco_pyro.inference import kernel
 from ddco_pyro.inference.arguments import refuse_impossible
-from ddco_pyro.inference.fused import side_by_side
+from ddco_pyro.inference.fused import rows_of
 from ddco_pyro.inference.kernel import Structure
 from ddco_pyro.model.tables import Tables
 
@@ -125,13 +125,13 @@ def _recursion(
 
     def some(first: int, last: int) -> None:
         longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
-        rows = side_by_side(tables.part(torch.arange(first, last), longest).normalised())
-        rows[..., controls] *= tables.power
+        rows = rows_of(tables.part(torch.arange(first, last), longest).normalised())
+        rows[controls] *= tables.power
         room = np.empty((longest + 1, size)), np.empty((longest, size))
         kernel.trace(
-            semiring, lengths[own].numpy(), rows.numpy(), uniforms[own], into[own], joint[own], ended[own],
+            semiring, lengths[own].numpy(), rows.permute(2, 1, 0).contiguous().numpy(), uniforms[own], into[own], joint[own], ended[own],
             possible[own], *room, structure.columns, *structure.tables,
         )  # fmt: skip
 
-    kernel.on_threads(some, lengths)
+    kernel.on_threads(some, len(lengths), int(lengths.sum()))
     return joint, ended, possible

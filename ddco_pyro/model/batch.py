@@ -13,6 +13,7 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.model.controls import ControlScaling
 from ddco_pyro.model.encoder import ObservationEncoder, padded
 from ddco_pyro.model.networks import Inputs
+from ddco_pyro.model.tables import by_step, by_trajectory
 
 STEPS_AT_ONCE = 8192
 """Most steps of a piece of a batch; fewer where a step takes much memory
@@ -69,7 +70,8 @@ class Batch:
         """
         lengths = self.lengths[rows].clamp(max=at_most or int(self.lengths.max()))
         steps = int(lengths.max())
-        return Batch(self.inputs.part(rows, slice(0, steps)), self.actions[rows, :steps], lengths)
+        actions = by_trajectory(by_step(self.actions)[:, :steps, rows].contiguous())
+        return Batch(self.inputs.part(rows, slice(0, steps)), actions, lengths)
 
     def varied(self, most: Mapping[str, int], seed: int) -> Batch:
         """An augmented batch, with pictures shifted at random.
@@ -93,6 +95,7 @@ def encode(
     refuse_unusable(demonstrations, encoder, scaling, fitted)
     inputs = encoder.inputs(demo.observations for demo in demonstrations)
     actions = padded([scaling.scaled(demo.controls(scaling.relative_to)) for demo in demonstrations]).float()
+    actions = by_trajectory(by_step(actions).contiguous())
     return Batch(inputs, actions, torch.tensor([len(demo) for demo in demonstrations]))
 
 

@@ -247,5 +247,5 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
 
 
 def padded(sequences: Sequence[np.ndarray]) -> Tensor:
-    """Arrays [T_n, ...] as one tensor [N, max T_n, ...], zeros past their ends."""
-    return nn.utils.rnn.pad_sequence([torch.as_tensor(sequence) for sequence in sequences], batch_first=True)
+    """Arrays [T_n, ...] as one tensor [N, max T_n, ...], zeros past their ends; in memory step by step."""
+    return nn.utils.rnn.pad_sequence([torch.as_tensor(sequence) for sequence in sequences]).transpose(0, 1)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ddco_pyro.model.emissions import Emission
-from ddco_pyro.model.tables import NEVER, Tables, always_ending, normalised
+from ddco_pyro.model.tables import NEVER, Tables, always_ending, by_step, by_trajectory, normalised
 
 TERMINATION_BOUND = 12.0
 """Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6), so no path's probability is ever exactly 0."""
@@ -19,6 +19,11 @@ TERMINATION_BOUND = 12.0
 def bounded(logits: Tensor) -> Tensor:
     """Termination logits within ±``TERMINATION_BOUND``, by a scaled tanh."""
     return TERMINATION_BOUND * torch.tanh(logits / TERMINATION_BOUND)
+
+
+def _from_zero(logits: Tensor) -> Tensor:
+    """Logits [k, N, T] beside zeros, [N, T, k, 2]."""
+    return by_trajectory(torch.stack([torch.zeros_like(logits), logits], 1))
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,8 @@ class CallerOutputs:
         """Logits of η [N, T, K, 1 + k] of callers with options below them, -inf where control is impossible."""
         if self.logits is None:
             return pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER)
-        return pad(self.logits, (1 + self.options - self.logits.shape[-1], 0), value=NEVER)
+        missing = 1 + self.options - self.logits.shape[-1]
+        return by_trajectory(pad(by_step(self.logits), (0, 0, 0, 0, missing, 0), value=NEVER))
 
     @property
     def selection(self) -> Tensor:
@@ -112,7 +118,7 @@ class Outputs:
         """Logits of going on and of ending, [N, T, k, 2]."""
         levels = zip(self.callers, self.termination_logits, strict=False)  # the meta-policy has none
         return tuple(
-            always_ending(level.shape) if logit is None else pad(bounded(logit).unsqueeze(-1), (1, 0))
+            always_ending(level.shape) if logit is None else _from_zero(bounded(by_step(logit)))
             for level, logit in levels
         )
 

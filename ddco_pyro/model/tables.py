@@ -78,8 +78,8 @@ class Tables:
         """These tables with log-probabilities in place of logits."""
         if not self.logits:
             return self
-        ratios = (table[..., 1] - table[..., 0] for table in self.termination)
-        termination = (logsigmoid(torch.stack([-ratio, ratio], -1)) for ratio in ratios)
+        ratios = (by_step(table[..., 1] - table[..., 0]) for table in self.termination)
+        termination = (by_trajectory(logsigmoid(torch.stack([-ratio, ratio], 1))) for ratio in ratios)
         return replace(
             self,
             selection=tuple(map(normalised, self.selection)),
@@ -148,6 +148,20 @@ class Tables:
             control=tuple(map(change, self.control)),
             evidence=tuple(None if own is None else change(own) for own in self.evidence),
         )
+
+
+def by_step(values: Tensor) -> Tensor:
+    """[N, T, ...] seen as [..., T, N].
+
+    What networks give, and what follows from it, has trajectories side by side in memory: torch computes
+    several times as fast so as over a last dimension of a few options or controls, and so does the pass.
+    """
+    return values.movedim((0, 1), (-1, -2))
+
+
+def by_trajectory(values: Tensor) -> Tensor:
+    """[..., T, N] seen as [N, T, ...]."""
+    return values.movedim((-1, -2), (0, 1))
 
 
 def normalised(logits: Tensor) -> Tensor:

@@ -33,11 +33,12 @@ from torch.nn.functional import softplus
 from ddco_pyro.model.batch import Batch
 from ddco_pyro.model.controls import ABOVE_FLOOR, raw_of
 from ddco_pyro.model.emissions import Emission, Information
+from ddco_pyro.model.emissions.base import over_dimensions
 from ddco_pyro.model.hierarchy import Caller, Hierarchy
 from ddco_pyro.model.networks.inputs import Inputs
 from ddco_pyro.model.networks.perceptrons import Mlp, StackedLinear
 from ddco_pyro.model.outputs import TERMINATION_BOUND, CallerOutputs, Outputs
-from ddco_pyro.model.tables import Tables
+from ddco_pyro.model.tables import Tables, by_step, by_trajectory
 from ddco_pyro.spec import RidgeSpec
 
 if TYPE_CHECKING:
@@ -71,42 +72,51 @@ class Features:
     it, and so are gradients of a piece. Sums over pieces, and the matrices that are solved, are float64.
 
     :param reads: the vectors that networks read; none for constants.
-    :ivar x: the vectors with a 1 at the end, [N, T, F].
+    :ivar x: the vectors with a 1 at the end, [T·N, F].
     """
 
     def __init__(self, inputs: Inputs, reads: Sequence[str]) -> None:
-        self.x = torch.cat([*(inputs.vectors[name] for name in reads), torch.ones(*inputs.batch, 1)], dim=-1)
+        vectors = [*(inputs.vectors[name] for name in reads), torch.ones(*inputs.batch, 1)]
+        self.shape = inputs.batch[::-1]
+        self.x = torch.cat([vector.transpose(0, 1) for vector in vectors], -1).flatten(0, 1)
 
     def outputs(self, weights: Sequence[Tensor]) -> list[Tensor]:
         """W^T x of networks with weights [K, F, n] each: [N, T, K, n] each."""
-        said = self.x.flatten(0, 1) @ torch.cat([own.transpose(0, 1).flatten(1) for own in weights], 1).to(
-            self.x
-        )
-        parts = said.split([own.shape[0] * own.shape[2] for own in weights], 1)
-        shapes = ((*self.x.shape[:2], own.shape[0], own.shape[2]) for own in weights)
-        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+        said = torch.cat([own.mT.flatten(0, 1) for own in weights]).to(self.x) @ self.x.T
+        parts = _parts(said.unflatten(1, self.shape), [own.shape[::2] for own in weights])
+        return [by_trajectory(part) for part in parts]
 
     def gradients(self, of: Sequence[Tensor]) -> list[Tensor]:
         """Σ_t x_t g_t^T of the gradients of the outputs of networks, [N, T, K, n] each: [K, F, n] each."""
-        sums = (self.x.flatten(0, 1).T @ torch.cat([own.flatten(0, 1).flatten(1) for own in of], 1)).double()
-        parts = sums.split([own.shape[2:].numel() for own in of], 1)
-        return [part.unflatten(1, own.shape[2:]).transpose(0, 1) for part, own in zip(parts, of, strict=True)]
+        sums = (self.x.T @ self._side_by_side(of).T).T.double()
+        return [part.mT for part in _parts(sums, [own.shape[2:] for own in of])]
 
-    def moments(self, weights: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Σ_t h_t x_t x_t^T for each column of weights [N·T, W], none below 0: [W, F, F] each."""
+    def moments(self, weights: Sequence[Tensor]) -> list[Tensor]:
+        """Σ_t h_t x_t x_t^T of weights h [N, T, K, n], none below 0: [K, n, F, F] each."""
         from ddco_pyro.inference.kernel import products  # and numba and pyro, which not every command needs
 
-        features = self.x.shape[-1]
+        features = self.x.shape[1]
+        each, x = self._side_by_side(weights).double().numpy(), self.x.numpy()
         pairs = np.empty((BLOCK, features * (features + 1) // 2))
-        found = torch.zeros(sum(own.shape[1] for own in weights), pairs.shape[1], dtype=torch.float64)
-        columns = torch.cat([*weights], 1).double()
-        for rows, own in zip(self.x.flatten(0, 1).split(BLOCK), columns.split(BLOCK), strict=True):
-            products(rows.double().numpy(), pairs)
-            found.addmm_(own.T, torch.from_numpy(pairs[: len(rows)]))
+        found = np.zeros((len(each), pairs.shape[1]))
+        for block in (slice(first, first + BLOCK) for first in range(0, len(x), BLOCK)):
+            rows = x[block].astype(np.float64)
+            products(rows, pairs)
+            found += each[:, block] @ pairs[: len(rows)]  # torch's own takes twice as long
         lower = torch.tril_indices(features, features)
-        whole = found.new_empty(len(found), features, features)
-        whole[:, *lower] = whole[:, *lower.flip(0)] = found
-        return whole.split([own.shape[1] for own in weights])
+        whole = torch.empty(len(found), features, features, dtype=torch.float64)
+        whole[:, *lower] = whole[:, *lower.flip(0)] = torch.from_numpy(found)
+        return _parts(whole, [own.shape[2:] for own in weights])
+
+    def _side_by_side(self, each: Sequence[Tensor]) -> Tensor:
+        """Numbers of networks, [N, T, K, n] or [N, T, K] each, one after the other: [columns, T·N]."""
+        return torch.cat([by_step(own).reshape(-1, len(self.x)) for own in each])
+
+
+def _parts(columns: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:
+    """Numbers of networks that stand one after the other, [columns, ...], in these shapes [*shape, ...]."""
+    parts = columns.split([shape.numel() for shape in shapes])
+    return [part.unflatten(0, shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 @dataclass
@@ -126,7 +136,7 @@ class Sums:
     def add_information(self, group: Information, moments: Tensor) -> None:
         """Add that of a piece from the moments of its weights."""
         _, information, count = self.groups.get(group.columns.start, (None, 0.0, 0.0))
-        information = information + moments.unflatten(0, group.weight.shape[2:])
+        information = information + moments
         number = group.weight if group.count is None else group.count
         self.groups[group.columns.start] = group, information, count + number.sum((0, 1))
 
@@ -442,7 +452,7 @@ class Expectation:
             selecting = (name for name in every if callers[name].options)
             for name, posterior, table in zip(selecting, chosen, tables.selection, strict=False):
                 if name in sums and posterior is not None and self._callers[name].sizes[0]:
-                    asked, p = posterior @ posterior.new_ones(posterior.shape[-1]), table.exp()
+                    asked, p = over_dimensions(posterior), table.exp()
                     columns = slice(0, self._callers[name].sizes[0])
                     of.setdefault(name, torch.zeros_like(said[name]))
                     of[name][..., columns] = (posterior - asked.unsqueeze(-1) * p)[..., -columns.stop :]
@@ -473,12 +483,12 @@ class Expectation:
                     continue  # none of those that read these vectors is trained
                 gradients = x.gradients([of[name] for name in its])
                 pairs = [(name, group) for name in its for group in learned.get(name, ())]
-                each = [group.weight.flatten(0, 1).flatten(1) for _, group in pairs]
+                moments = x.moments([group.weight for _, group in pairs])
                 for name, gradient in zip(its, gradients, strict=True):
                     sums[name].gradient = sums[name].gradient + gradient
                     if (of_sigma := of_std.get(name)) is not None:
                         sums[name].std = sums[name].std + of_sigma / power  # densities count that many times
-                for (name, group), part in zip(pairs, x.moments(each), strict=True):
+                for (name, group), part in zip(pairs, moments, strict=True):
                     sums[name].add_information(group, part)
         return float(value.detach())
 

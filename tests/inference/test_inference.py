@@ -80,7 +80,7 @@ def test_threads_change_no_bit(counts, hybrid):
         try:
             value, own = log_likelihood(tables, lengths), posterior(tables, lengths)
             found.append([value, *own.u, *own.v, *own.w, *segment(tables, lengths)])
-            on_threads(lambda first, last: parts.append((first, last)), lengths)
+            on_threads(lambda first, last: parts.append((first, last)), len(lengths), int(lengths.sum()))
         finally:
             torch.set_num_threads(1)
     assert sorted(parts) == [(0, 2), (0, 2), (0, 5), (2, 5), (2, 5)]  # 7604 steps are worth two threads

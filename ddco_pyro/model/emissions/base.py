@@ -24,6 +24,14 @@ Part = Mapping[str, Any]
 """A part of the control as an export describes it."""
 
 
+def over_dimensions(each: Tensor) -> Tensor:
+    """The sum over the control's dimensions, [..., K, A] to [..., K], with steps side by side in memory.
+
+    torch's own sum over the last dimension gives other strides, and takes several times as long.
+    """
+    return each.movedim((-2, -1), (0, 1)).sum(1).movedim(0, -1)
+
+
 def phi(z: float) -> float:
     """The standard normal distribution function."""
     return 0.5 * math.erfc(-z / math.sqrt(2))
@@ -135,7 +143,7 @@ class Emission(ABC):
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s) [..., K]: dimensions are independent given the caller, unless a kind says otherwise."""
-        return self.by_dimension(actions).sum(-1)
+        return over_dimensions(self.by_dimension(actions))
 
     @property
     @abstractmethod

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ddco_pyro.model.emissions.base import LOG_2PI, Given
+from ddco_pyro.model.emissions.base import LOG_2PI, Given, over_dimensions
 from ddco_pyro.model.emissions.gaussian import Gaussian
 
 
@@ -38,20 +38,18 @@ class Clipped(Gaussian):
 
     def log_density(self, actions: Tensor) -> Tensor:
         """log π(a | s), [..., K]."""
-        return self._summed(self._each(actions))
+        return over_dimensions(self.by_dimension(actions))
 
-    def _each(self, actions: Tensor) -> Tensor:
-        """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on a bound, [..., K·A]."""
-        callers, size = self.shape[-2:]
-        side = ((actions <= self.low).float() - (actions >= self.high).float()).flatten(0, -2)
-        step, dim = side.nonzero(as_tuple=True)  # log Φ is computed on bounds alone, for each caller
-        places = (step * (callers * size) + dim + size * torch.arange(callers).unsqueeze(1)).flatten()
+    def by_dimension(self, actions: Tensor) -> Tensor:
+        """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on a bound, [..., K, A]."""
         errors = self._errors(actions.clamp(self.low, self.high))
-        mass = LogNormal.apply(
-            (errors.flatten().index_select(0, places).view(callers, -1) * side[step, dim]).flatten()
-        )
-        each = self._scored(errors)
-        return each.flatten().index_copy(0, places, mass).reshape(each.shape)
+        each = self._scored(errors).movedim((-2, -1), (0, 1))
+        side = ((actions <= self.low).float() - (actions >= self.high).float()).movedim(-1, 0)
+        place = side.flatten().nonzero().squeeze(1)  # log Φ is computed on bounds alone, for each caller
+        places = (place + side.numel() * torch.arange(len(each)).unsqueeze(1)).flatten()
+        beyond = errors.movedim((-2, -1), (0, 1)).flatten().index_select(0, places)
+        mass = LogNormal.apply(beyond * side.flatten().index_select(0, place).repeat(len(each)))
+        return each.flatten().index_copy(0, places, mass).view(each.shape).movedim((0, 1), (-2, -1))
 
     @property
     def mode(self) -> Tensor:

@@ -133,10 +133,9 @@ class Inputs:
 
     def part(self, rows: Tensor | slice, steps: slice) -> Inputs:
         """Consecutive steps of some trajectories; nothing is read."""
-        vectors, images = (
-            {key: array[rows, steps] for key, array in arrays.items()}
-            for arrays in (self.vectors, self.images)
-        )
+        each = {key: vector.transpose(0, 1)[steps, rows] for key, vector in self.vectors.items()}
+        vectors = {key: vector.transpose(0, 1) for key, vector in each.items()}
+        images = {key: image[rows, steps] for key, image in self.images.items()}
         return Inputs(vectors, images, self.time[steps])
 
     def loaded(self) -> Inputs:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
+from ddco_pyro.model.tables import by_trajectory
 from ddco_pyro.spec import Activation
 
 NumpyForm = dict[str, Any]
@@ -61,10 +62,9 @@ class StackedLinear(nn.Module):
         if maps is not None:
             return torch.baddbmm(self.bias[maps], x, self.weight[maps])
         if x.shape[0] > 1:
-            return torch.baddbmm(self.bias, x, self.weight)
-        copies, inputs, outputs = self.weight.shape
-        side_by_side = self.weight.transpose(0, 1).reshape(inputs, copies * outputs)
-        return (x[0] @ side_by_side).reshape(-1, copies, outputs).transpose(0, 1) + self.bias
+            return torch.baddbmm(self.bias.mT, self.weight.mT, x.mT).mT
+        each = torch.addmm(self.bias.flatten().unsqueeze(1), self.weight.mT.flatten(0, 1), x[0].T)
+        return each.unflatten(0, (len(self.weight), -1)).mT
 
 
 class Perceptrons(nn.Sequential):
@@ -167,7 +167,9 @@ class Mlp(Network):
         return len(self.layers) == 1
 
     def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
-        return options_last(self.layers(self._read(inputs).flatten(0, 1).unsqueeze(0)), inputs.batch), state
+        values = self._read(inputs).transpose(0, 1)
+        said: Tensor = self.layers(values.flatten(0, 1).unsqueeze(0))
+        return by_trajectory(said.mT.unflatten(2, values.shape[:2])), state
 
     def _read(self, inputs: Inputs) -> Tensor:
         """The vectors that it reads, side by side, [N, T, F]."""
@@ -197,13 +199,13 @@ def linear_maps(networks: Mapping[str, Network], inputs: Inputs) -> dict[str, Te
             readers.setdefault(tuple(network.reads), {})[name] = layer
     given: dict[str, Tensor] = {}
     for reads, layers in readers.items():
-        weight = torch.cat([layer.weight.transpose(0, 1).flatten(1) for layer in layers.values()], 1)
-        bias = torch.cat([layer.bias.flatten() for layer in layers.values()])
+        weight = torch.cat([layer.weight.mT.flatten(0, 1) for layer in layers.values()])
+        bias = torch.cat([layer.bias.flatten() for layer in layers.values()]).unsqueeze(1)
         vectors = torch.cat([inputs.vectors[name] for name in reads], -1) if reads else inputs.vector[..., :0]
-        said = torch.addmm(bias, vectors.flatten(0, 1), weight).unflatten(0, inputs.batch)
-        parts = said.split([layer.bias.numel() for layer in layers.values()], -1)
+        said = torch.addmm(bias, weight, vectors.transpose(0, 1).flatten(0, 1).T)
+        parts = said.unflatten(1, inputs.batch[::-1]).split([layer.bias.numel() for layer in layers.values()])
         for part, (name, layer) in zip(parts, layers.items(), strict=True):
-            given[name] = part.unflatten(-1, (layer.bias.shape[0], layer.bias.shape[2]))
+            given[name] = by_trajectory(part.unflatten(0, (len(layer.bias), -1)))
     return given
 
 
