@@ -13,7 +13,7 @@ from ddco_pyro.data.demonstrations import Demonstrations, DemonstrationsError
 from ddco_pyro.model.controls import ControlScaling
 from ddco_pyro.model.encoder import ObservationEncoder, padded
 from ddco_pyro.model.networks import Inputs
-from ddco_pyro.model.tables import by_step, by_trajectory
+from ddco_pyro.model.tables import consecutive, part
 
 STEPS_AT_ONCE = 8192
 """Most steps of a piece of a batch; fewer where a step takes much memory
@@ -70,8 +70,8 @@ class Batch:
         """
         lengths = self.lengths[rows].clamp(max=at_most or int(self.lengths.max()))
         steps = int(lengths.max())
-        actions = by_trajectory(by_step(self.actions)[:, :steps, rows].contiguous())
-        return Batch(self.inputs.part(rows, slice(0, steps)), actions, lengths)
+        chosen, first = consecutive(rows), slice(0, steps)
+        return Batch(self.inputs.part(chosen, first), part(self.actions, chosen, first), lengths)
 
     def varied(self, most: Mapping[str, int], seed: int) -> Batch:
         """An augmented batch, with pictures shifted at random.
@@ -95,7 +95,6 @@ def encode(
     refuse_unusable(demonstrations, encoder, scaling, fitted)
     inputs = encoder.inputs(demo.observations for demo in demonstrations)
     actions = padded([scaling.scaled(demo.controls(scaling.relative_to)) for demo in demonstrations]).float()
-    actions = by_trajectory(by_step(actions).contiguous())
     return Batch(inputs, actions, torch.tensor([len(demo) for demo in demonstrations]))
 
 

@@ -14,6 +14,7 @@ from ddco_pyro.data.demonstrations import Demonstrations
 from ddco_pyro.data.pictures import Transform, TransformError
 from ddco_pyro.model.networks import Inputs, InputShape, ShapeError
 from ddco_pyro.model.networks.inputs import Frames
+from ddco_pyro.model.tables import by_step, by_trajectory
 from ddco_pyro.spec import STEP, ObservationSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -247,5 +248,6 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
 
 
 def padded(sequences: Sequence[np.ndarray]) -> Tensor:
-    """Arrays [T_n, ...] as one tensor [N, max T_n, ...], zeros past their ends; in memory step by step."""
-    return nn.utils.rnn.pad_sequence([torch.as_tensor(sequence) for sequence in sequences]).transpose(0, 1)
+    """Arrays [T_n, ...] as one tensor [N, max T_n, ...], zeros past their ends; in memory [..., T, N]."""
+    each = [torch.as_tensor(sequence) for sequence in sequences]
+    return by_trajectory(by_step(nn.utils.rnn.pad_sequence(each, batch_first=True)).contiguous())

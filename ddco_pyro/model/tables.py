@@ -136,7 +136,7 @@ class Tables:
 
     def part(self, rows: Tensor, steps: int) -> Tables:
         """The first steps of the trajectories ``rows`` [M] alone; without a copy where these stand side by side."""
-        chosen = slice(int(rows[0]), int(rows[-1]) + 1) if bool((rows.diff() == 1).all()) else rows
+        chosen = consecutive(rows)
         return self.map(lambda table: table[chosen, :steps])
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Tables:
@@ -162,6 +162,16 @@ def by_step(values: Tensor) -> Tensor:
 def by_trajectory(values: Tensor) -> Tensor:
     """[..., T, N] seen as [N, T, ...]."""
     return values.movedim((-1, -2), (0, 1))
+
+
+def part(values: Tensor, rows: Tensor | slice, steps: slice) -> Tensor:
+    """Steps of some trajectories of [N, T, ...], with these trajectories side by side in memory."""
+    return by_trajectory(by_step(values)[..., steps, rows].contiguous())
+
+
+def consecutive(rows: Tensor) -> Tensor | slice:
+    """Indices of trajectories [M]; a slice, which copies nothing, where they are consecutive."""
+    return slice(int(rows[0]), int(rows[-1]) + 1) if bool((rows.diff() == 1).all()) else rows
 
 
 def normalised(logits: Tensor) -> Tensor:

@@ -72,31 +72,31 @@ class Features:
     it, and so are gradients of a piece. Sums over pieces, and the matrices that are solved, are float64.
 
     :param reads: the vectors that networks read; none for constants.
-    :ivar x: the vectors with a 1 at the end, [T·N, F].
+    :ivar x: the vectors with a 1 at the end, [F, T·N].
     """
 
     def __init__(self, inputs: Inputs, reads: Sequence[str]) -> None:
-        vectors = [*(inputs.vectors[name] for name in reads), torch.ones(*inputs.batch, 1)]
-        self.shape = inputs.batch[::-1]
-        self.x = torch.cat([vector.transpose(0, 1) for vector in vectors], -1).flatten(0, 1)
+        vectors = by_step(inputs.joined(reads))
+        self.shape = vectors.shape[1:]
+        self.x = torch.cat([vectors, torch.ones(1, *self.shape)]).flatten(1)
 
     def outputs(self, weights: Sequence[Tensor]) -> list[Tensor]:
         """W^T x of networks with weights [K, F, n] each: [N, T, K, n] each."""
-        said = torch.cat([own.mT.flatten(0, 1) for own in weights]).to(self.x) @ self.x.T
+        said = torch.cat([own.mT.flatten(0, 1) for own in weights]).to(self.x) @ self.x
         parts = _parts(said.unflatten(1, self.shape), [own.shape[::2] for own in weights])
         return [by_trajectory(part) for part in parts]
 
     def gradients(self, of: Sequence[Tensor]) -> list[Tensor]:
         """Σ_t x_t g_t^T of the gradients of the outputs of networks, [N, T, K, n] each: [K, F, n] each."""
-        sums = (self.x.T @ self._side_by_side(of).T).T.double()
+        sums = (self.x @ self._side_by_side(of).T).T.double()
         return [part.mT for part in _parts(sums, [own.shape[2:] for own in of])]
 
     def moments(self, weights: Sequence[Tensor]) -> list[Tensor]:
         """Σ_t h_t x_t x_t^T of weights h [N, T, K, n], none below 0: [K, n, F, F] each."""
         from ddco_pyro.inference.kernel import products  # and numba and pyro, which not every command needs
 
-        features = self.x.shape[1]
-        each, x = self._side_by_side(weights).double().numpy(), self.x.numpy()
+        features = len(self.x)
+        each, x = self._side_by_side(weights).double().numpy(), self.x.T.numpy()
         pairs = np.empty((BLOCK, features * (features + 1) // 2))
         found = np.zeros((len(each), pairs.shape[1]))
         for block in (slice(first, first + BLOCK) for first in range(0, len(x), BLOCK)):
@@ -110,7 +110,7 @@ class Features:
 
     def _side_by_side(self, each: Sequence[Tensor]) -> Tensor:
         """Numbers of networks, [N, T, K, n] or [N, T, K] each, one after the other: [columns, T·N]."""
-        return torch.cat([by_step(own).reshape(-1, len(self.x)) for own in each])
+        return torch.cat([by_step(own).reshape(-1, self.x.shape[1]) for own in each])
 
 
 def _parts(columns: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:

@@ -14,6 +14,7 @@ from torch import Tensor
 from ddco_pyro.data.arrays import Observed
 from ddco_pyro.data.pictures import Transform, padded
 from ddco_pyro.errors import nearest
+from ddco_pyro.model.tables import by_step, by_trajectory, part
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +117,14 @@ class Inputs:
     @cached_property
     def vector(self) -> Tensor:
         """All vectors side by side, [N, T, F]."""
-        vectors = list(self.vectors.values())
-        if len(vectors) == 1:
-            return vectors[0]
-        return torch.cat(vectors, -1) if vectors else torch.zeros(*self.batch, 0, device=self.time.device)
+        return self.joined([*self.vectors])
+
+    def joined(self, names: Sequence[str]) -> Tensor:
+        """These vectors side by side, [N, T, F]; F is 0 where there are none."""
+        if not names:
+            return torch.zeros(*self.batch, 0, device=self.time.device)
+        each = [by_step(self.vectors[name]) for name in names]
+        return by_trajectory(torch.cat(each) if len(each) > 1 else each[0])
 
     def select(self, names: Sequence[str]) -> Inputs:
         """These observations alone, in this order; nothing is read."""
@@ -133,8 +138,7 @@ class Inputs:
 
     def part(self, rows: Tensor | slice, steps: slice) -> Inputs:
         """Consecutive steps of some trajectories; nothing is read."""
-        each = {key: vector.transpose(0, 1)[steps, rows] for key, vector in self.vectors.items()}
-        vectors = {key: vector.transpose(0, 1) for key, vector in each.items()}
+        vectors = {key: part(vector, rows, steps) for key, vector in self.vectors.items()}
         images = {key: image[rows, steps] for key, image in self.images.items()}
         return Inputs(vectors, images, self.time[steps])
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ddco_pyro.model.networks.inputs import Inputs, InputShape, ShapeError
-from ddco_pyro.model.tables import by_trajectory
+from ddco_pyro.model.tables import by_step, by_trajectory
 from ddco_pyro.spec import Activation
 
 NumpyForm = dict[str, Any]
@@ -167,9 +167,9 @@ class Mlp(Network):
         return len(self.layers) == 1
 
     def forward(self, inputs: Inputs, state: State = ()) -> tuple[Tensor, State]:
-        values = self._read(inputs).transpose(0, 1)
-        said: Tensor = self.layers(values.flatten(0, 1).unsqueeze(0))
-        return by_trajectory(said.mT.unflatten(2, values.shape[:2])), state
+        values = by_step(self._read(inputs))
+        said: Tensor = self.layers(values.flatten(1).T.unsqueeze(0))
+        return by_trajectory(said.mT.unflatten(2, values.shape[1:])), state
 
     def _read(self, inputs: Inputs) -> Tensor:
         """The vectors that it reads, side by side, [N, T, F]."""
@@ -201,9 +201,9 @@ def linear_maps(networks: Mapping[str, Network], inputs: Inputs) -> dict[str, Te
     for reads, layers in readers.items():
         weight = torch.cat([layer.weight.mT.flatten(0, 1) for layer in layers.values()])
         bias = torch.cat([layer.bias.flatten() for layer in layers.values()]).unsqueeze(1)
-        vectors = torch.cat([inputs.vectors[name] for name in reads], -1) if reads else inputs.vector[..., :0]
-        said = torch.addmm(bias, weight, vectors.transpose(0, 1).flatten(0, 1).T)
-        parts = said.unflatten(1, inputs.batch[::-1]).split([layer.bias.numel() for layer in layers.values()])
+        values = by_step(inputs.joined(reads))
+        said = torch.addmm(bias, weight, values.flatten(1)).unflatten(1, values.shape[1:])
+        parts = said.split([layer.bias.numel() for layer in layers.values()])
         for part, (name, layer) in zip(parts, layers.items(), strict=True):
             given[name] = by_trajectory(part.unflatten(0, (len(layer.bias), -1)))
     return given
