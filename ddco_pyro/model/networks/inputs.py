@@ -121,9 +121,9 @@ class Inputs:
 
     def joined(self, names: Sequence[str]) -> Tensor:
         """These vectors side by side, [N, T, F]; F is 0 where there are none."""
-        if not names:
+        if not self.vectors:
             return torch.zeros(*self.batch, 0, device=self.time.device)
-        each = [by_step(self.vectors[name]) for name in names]
+        each = [by_step(self.vectors[name]) for name in names] or [by_step(self.vector)[:0]]
         return by_trajectory(torch.cat(each) if len(each) > 1 else each[0])
 
     def select(self, names: Sequence[str]) -> Inputs:
