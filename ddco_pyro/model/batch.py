@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from ddco_pyro.model.encoder import ObservationEncoder, padded
 from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import consecutive, part
 
-STEPS_AT_ONCE = 8192
+STEPS_AT_ONCE = 12288
 """Most steps of a piece of a batch; fewer where a step takes much memory
 (:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`). Memory stays bounded, and what the networks
 compute stays in the cache: with MLP-64 options over 50 × 2000 steps a gradient step takes 0.6 of the time in
@@ -63,6 +63,10 @@ class Batch:
         for rows in torch.arange(len(self)).split(max(steps // longest, 1)):
             yield rows, self.select(rows) if len(rows) < len(self) else self
 
+    def parts(self, rows: Tensor, steps: int) -> Parts:
+        """The demonstrations ``rows`` [M] in :meth:`pieces`, each with its own."""
+        return [(rows[part], piece) for part, piece in self.select(rows).pieces(steps)]
+
     def select(self, rows: Tensor, at_most: int | None = None) -> Batch:
         """The demonstrations ``rows`` [M], padded to the longest among them.
 
@@ -83,6 +87,10 @@ class Batch:
             shifts = random.integers(-pixels, pixels + 1, (len(self), 2))
             images[key] = replace(images[key], shifts=shifts)
         return replace(self, inputs=replace(self.inputs, images=images)) if most else self
+
+
+Parts = Sequence[tuple[Tensor, Batch]]
+"""Demonstrations in pieces, each with its rows."""
 
 
 def encode(

@@ -247,6 +247,8 @@ class ControlStd(nn.Module):
 
 def _with_columns(table: Tensor, places: Sequence[int], values: Tensor) -> Tensor:
     """A table [C] or [K, C] with values [..., S] at S of its places, [..., C]."""
+    if len(places) == table.shape[-1]:
+        return values
     columns = list(table.expand(*values.shape[:-1], -1).unbind(-1))
     for place, column in zip(places, values.unbind(-1), strict=True):
         columns[place] = column

@@ -150,18 +150,19 @@ class Tables:
         )
 
 
-def by_step(values: Tensor) -> Tensor:
-    """[N, T, ...] seen as [..., T, N].
+def by_step(values: Tensor, before: int = 2) -> Tensor:
+    """[N, T, ...] seen as [..., T, N]: so many first dimensions, in reverse order, behind the others.
 
     What networks give, and what follows from it, has trajectories side by side in memory: torch computes
     several times as fast so as over a last dimension of a few options or controls, and so does the pass.
     """
-    return values.movedim((0, 1), (-1, -2))
+    return values.permute(*range(before, values.dim()), *reversed(range(before)))
 
 
-def by_trajectory(values: Tensor) -> Tensor:
+def by_trajectory(values: Tensor, before: int = 2) -> Tensor:
     """[..., T, N] seen as [N, T, ...]."""
-    return values.movedim((-1, -2), (0, 1))
+    behind = values.dim() - before
+    return values.permute(*reversed(range(behind, values.dim())), *range(behind))
 
 
 def part(values: Tensor, rows: Tensor | slice, steps: slice) -> Tensor:

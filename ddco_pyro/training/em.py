@@ -58,8 +58,8 @@ ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
 MOST = 100_000
 """The most steps that such a stage learns from, of demonstrations spread evenly over their lengths."""
-BLOCK = 512
-"""Steps whose features are multiplied at once: the products stay in the cache."""
+BLOCK = 65536
+"""Products of features that are computed at once: they stay in the cache."""
 BIAS = 1e-6
 """Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
@@ -97,9 +97,10 @@ class Features:
 
         features = len(self.x)
         each, x = self._side_by_side(weights).double().numpy(), self.x.T.numpy()
-        pairs = np.empty((BLOCK, features * (features + 1) // 2))
-        found = np.zeros((len(each), pairs.shape[1]))
-        for block in (slice(first, first + BLOCK) for first in range(0, len(x), BLOCK)):
+        number = features * (features + 1) // 2
+        pairs = np.empty((1 + BLOCK // number, number))
+        found = np.zeros((len(each), number))
+        for block in (slice(first, first + len(pairs)) for first in range(0, len(x), len(pairs))):
             rows = x[block].astype(np.float64)
             products(rows, pairs)
             found += each[:, block] @ pairs[: len(rows)]  # torch's own takes twice as long
@@ -383,11 +384,8 @@ class Expectation:
         total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
         if not self._pieces:
             order = batch.by_length[:: math.ceil(batch.steps / MOST) if self._roughly else 1]
-            chosen = batch.select(order)
-            self._pieces = [
-                (order[rows], piece, {}) for rows, piece in chosen.pieces(self.model.steps_at_once)
-            ]
-            self.steps = chosen.steps
+            self._pieces = [(*part, {}) for part in batch.parts(order, self.model.steps_at_once)]
+            self.steps = int(batch.lengths[order].sum())
         for piece in self._pieces:
             total += self._expect_piece(*piece, sums)
         return total, total + self._penalty(sums), sums

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ddco_pyro.events import EpochEnded, OnEvent, ignore
-from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.batch import Batch, Parts
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seed as seed_generators
 from ddco_pyro.model.seeding import seeded
@@ -223,7 +223,7 @@ class StageTraining:
         """
         self.optimizer.zero_grad()
         if self.spec.shards == 1:
-            value = backward(self.objective, self.model, batch, rows)
+            value = backward(self.objective, self.model, batch.parts(rows, self.model.steps_at_once))
         else:
             value = self._backward_in_shards(batch, rows, number)
         self.optimizer.step()
@@ -253,7 +253,8 @@ class StageTraining:
         """
         self.optimizer.zero_grad()
         seed_generators(seed, self.model.device)
-        value = backward(self.objective, self.model, batch, rows, steps)
+        parts = batch.parts(rows, self.model.steps_at_once)
+        value = backward(self.objective, self.model, parts, steps)
         return value, [None if p.grad is None else p.grad.cpu().numpy() for p in self.parameters]
 
     def states(self) -> dict[str, State]:
@@ -286,30 +287,28 @@ class StageTraining:
         now.ended.append(stage_end(self.stage.name, cap, now.tune, self.spec.patience, self._at_optimum))
 
 
-def backward(
-    objective: Objective, model: Hierarchy, batch: Batch, rows: Tensor, steps: int | None = None
-) -> float:
+def backward(objective: Objective, model: Hierarchy, parts: Parts, steps: int | None = None) -> float:
     """Add the gradient of the loss of some demonstrations to the parameters' gradients.
 
     The loss is minus the objective per step, and minus the log-prior of a library per step of all training
-    demonstrations. A batch that is long is processed in pieces.
+    demonstrations.
 
-    :param rows: the demonstrations, [M].
+    :param parts: the demonstrations in pieces, each with its rows.
     :param steps: of the minibatch of which the demonstrations are a shard; None where they are all of it.
     :returns: what the demonstrations add to the objective, nats.
     :raises Diverged: the objective is not finite.
     """
-    batch, total = batch.select(rows), 0.0
-    for part, piece in batch.pieces(model.steps_at_once):
-        tables = objective.tables(model, piece, rows[part])  # networks → tables
+    own, total = sum(piece.steps for _, piece in parts), 0.0
+    for rows, piece in parts:
+        tables = objective.tables(model, piece, rows)  # networks → tables
         value = objective.values(tables, piece.lengths).sum()  # exact log-likelihood, all options summed out
         if not bool(torch.isfinite(value.detach())):
-            raise objective.diverged(tables, piece.lengths, rows[part])
-        (-value / (steps or batch.steps)).backward()  # posteriors weight the networks' gradients
+            raise objective.diverged(tables, piece.lengths, rows)
+        (-value / (steps or own)).backward()  # posteriors weight the networks' gradients
         total += float(value.detach())
     if (library := objective.data.library) is not None:
-        share = batch.steps / objective.data.train.steps  # of the prior, which all demonstrations have once
+        share = own / objective.data.train.steps  # of the prior, which all demonstrations have once
         prior = share * library.log_density(model)
-        (-prior / (steps or batch.steps)).backward()  # type: ignore[no-untyped-call]
+        (-prior / (steps or own)).backward()  # type: ignore[no-untyped-call]
         total += float(prior.detach())
     return total / objective.likelihoods

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
-from ddco_pyro.model.batch import Batch
+from ddco_pyro.model.batch import Batch, Parts
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.networks.perceptrons import Mlp, PerTimestep
 from ddco_pyro.spec import OptimizerSpec
@@ -108,9 +108,7 @@ class QuasiNewton:
     :ivar steps: steps of the demonstrations, once the first step has begun.
     """
 
-    def __init__(
-        self, model: Hierarchy, backward: Callable[[Hierarchy, Batch, Tensor], float], decay: float
-    ) -> None:
+    def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Parts], float], decay: float) -> None:
         self.model, self._backward, self._decay, self.steps = model, backward, decay, 0
         self._gains = [math.inf]
         self._parameters = list(model.parameters())
@@ -119,6 +117,7 @@ class QuasiNewton:
             tolerance_change=0.0, line_search_fn="strong_wolfe",
         )  # fmt: skip
         self._evaluated: list[tuple[Tensor, float, float, list[Tensor]]] = []
+        self._parts: Parts = []
 
     @property
     def converged(self) -> bool:
@@ -126,24 +125,26 @@ class QuasiNewton:
         return max(self._gains[-2:]) < TOLERANCE
 
     def step(self, batch: Batch) -> float:
-        """One step; the log-likelihood before it, nats."""
-        self.steps = batch.steps
-        loss, value = self._evaluate(batch)
-        self._optimizer.step(lambda: self._evaluate(batch)[0])
-        self._gains.append(loss - self._evaluate(batch)[0])
+        """One step, always over the same demonstrations; their log-likelihood before it, nats."""
+        if not self._parts:
+            self._parts = batch.parts(batch.by_length, self.model.steps_at_once)
+            self.steps = batch.steps
+        loss, value = self._evaluate()
+        self._optimizer.step(lambda: self._evaluate()[0])
+        self._gains.append(loss - self._evaluate()[0])
         self._evaluated = self._evaluated[-1:]
         return value
 
-    def _evaluate(self, batch: Batch) -> tuple[float, float]:
+    def _evaluate(self) -> tuple[float, float]:
         """The loss and the log-likelihood, with the gradient in the parameters; nothing is computed twice."""
         weights = nn.utils.parameters_to_vector(self._parameters).detach()
         evaluation = next((before for before in self._evaluated if torch.equal(before[0], weights)), None)
         if evaluation is None:
             self._optimizer.zero_grad()
             with torch.enable_grad():
-                value = self._backward(self.model, batch, batch.by_length)
+                value = self._backward(self.model, self._parts)
             gradients = [p.grad + self._decay * p.detach() for p in self._parameters if p.grad is not None]
-            loss = 0.5 * self._decay * float(weights @ weights) - value / batch.steps
+            loss = 0.5 * self._decay * float(weights @ weights) - value / self.steps
             evaluation = weights, loss, value, gradients
         self._evaluated = [before for before in self._evaluated if before is not evaluation] + [evaluation]
         for parameter, gradient in zip(self._parameters, evaluation[3], strict=True):

@@ -100,9 +100,7 @@ def test_it_is_the_likelihood_of_the_paths_that_have_the_labels(counts, level):
                 if all(option in (-1, h[level - 1]) for option, h in zip(known, path, strict=True))
             )
             values[name] += math.log(total)
-    assert backward(objective, model, material.train, torch.arange(len(material.train))) == pytest.approx(
-        values["train"], abs=1e-5
-    )
+    assert backward(objective, model, [*material.train.pieces()]) == pytest.approx(values["train"], abs=1e-5)
     assert objective.tune(model) == pytest.approx(values["tune"] / STEPS, abs=1e-5)
 
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ddco_pyro.data.controls import ControlPart
+from ddco_pyro.model.tables import by_step, by_trajectory
 
 LOG_2PI = math.log(2 * math.pi)
 
@@ -25,11 +26,8 @@ Part = Mapping[str, Any]
 
 
 def over_dimensions(each: Tensor) -> Tensor:
-    """The sum over the control's dimensions, [..., K, A] to [..., K], with steps side by side in memory.
-
-    torch's own sum over the last dimension gives other strides, and takes several times as long.
-    """
-    return each.movedim((-2, -1), (0, 1)).sum(1).movedim(0, -1)
+    """The sum over the control's dimensions, [..., K, A] to [..., K], in the same order in memory."""
+    return by_trajectory(by_step(each, each.dim() - 2).sum(1), each.dim() - 2)
 
 
 def phi(z: float) -> float:

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from ddco_pyro.model.emissions.base import LOG_2PI, Given, over_dimensions
 from ddco_pyro.model.emissions.gaussian import Gaussian
+from ddco_pyro.model.tables import by_step, by_trajectory
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,15 @@ class Clipped(Gaussian):
 
     def by_dimension(self, actions: Tensor) -> Tensor:
         """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on a bound, [..., K, A]."""
-        errors = self._errors(actions.clamp(self.low, self.high))
-        each = self._scored(errors).movedim((-2, -1), (0, 1))
-        side = ((actions <= self.low).float() - (actions >= self.high).float()).movedim(-1, 0)
-        place = side.flatten().nonzero().squeeze(1)  # log Φ is computed on bounds alone, for each caller
-        places = (place + side.numel() * torch.arange(len(each)).unsqueeze(1)).flatten()
-        beyond = errors.movedim((-2, -1), (0, 1)).flatten().index_select(0, places)
-        mass = LogNormal.apply(beyond * side.flatten().index_select(0, place).repeat(len(each)))
-        return each.flatten().index_copy(0, places, mass).view(each.shape).movedim((0, 1), (-2, -1))
+        errors, before = self._errors(actions.clamp(self.low, self.high)), actions.dim() - 1
+        each = by_step(self._scored(errors), before)
+        side = (actions <= self.low).float() - (actions >= self.high).float()
+        side = by_step(side, before).flatten()
+        place = side.nonzero().squeeze(1)  # log Φ is computed on bounds alone, for each caller
+        places = (place + len(side) * torch.arange(len(each)).unsqueeze(1)).flatten()
+        beyond = by_step(errors, before).flatten().index_select(0, places)
+        mass = LogNormal.apply(beyond * side.index_select(0, place).repeat(len(each)))
+        return by_trajectory(each.flatten().index_copy(0, places, mass).view(each.shape), before)
 
     @property
     def mode(self) -> Tensor:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddco_pyro.model.emissions.base import Information, Part
+from ddco_pyro.model.emissions.base import Information, Part, over_dimensions
 from ddco_pyro.model.emissions.gaussian import Gaussian, continuous_control
 
 NU = 4
@@ -47,7 +47,7 @@ class Student(Gaussian):
     def log_density(self, actions: Tensor) -> Tensor:
         """log t_ν(a; μ, σ²), float64 [..., K]."""
         size = self.mean.shape[-1]
-        tail = 0.5 * (NU + size) * (self._residuals(actions).square().sum(-1) / NU).log1p()
+        tail = 0.5 * (NU + size) * (over_dimensions(self._residuals(actions).square()) / NU).log1p()
         constant = math.lgamma((NU + size) / 2) - math.lgamma(NU / 2) - 0.5 * size * math.log(NU * math.pi)
         return constant - tail - (self.std.double().log() + self.log_scale).sum(-1)
 
@@ -68,7 +68,7 @@ class Student(Gaussian):
     def information(self, acting: Tensor, actions: Tensor) -> Iterator[Information]:
         """That of a normal whose errors count with their expected precisions."""
         size = self.mean.shape[-1]
-        precision = (NU + size) / (NU + self._residuals(actions).square().sum(-1))
+        precision = (NU + size) / (NU + over_dimensions(self._residuals(actions).square()))
         yield Information(slice(0, size), acting * precision, std=tuple(range(size)), count=acting)
 
     def draw(self, noise: Tensor) -> Tensor:

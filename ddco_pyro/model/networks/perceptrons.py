@@ -63,7 +63,7 @@ class StackedLinear(nn.Module):
             return torch.baddbmm(self.bias[maps], x, self.weight[maps])
         if x.shape[0] > 1:
             return torch.baddbmm(self.bias.mT, self.weight.mT, x.mT).mT
-        each = torch.addmm(self.bias.flatten().unsqueeze(1), self.weight.mT.flatten(0, 1), x[0].T)
+        each = torch.addmm(self.bias.flatten().unsqueeze(1), self.weight.mT.flatten(0, 1), x.squeeze(0).T)
         return each.unflatten(0, (len(self.weight), -1)).mT
 
 
