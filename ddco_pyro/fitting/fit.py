@@ -322,6 +322,8 @@ def _again(spec: Spec, seed: int, folder: Path) -> Metrics:
 
 LONG = 1000
 """Gradient steps, at least, of a training that takes longer than starting a process."""
+MANY = 50_000
+"""Steps of demonstrations, at least, for the same where each step of a training is over all of them."""
 LITTLE = 256e6
 """Bytes of demonstrations, at most, that another process gets a copy of."""
 
@@ -332,9 +334,9 @@ def _over_all(spec: Spec, networks: Hierarchy) -> bool:
 
 
 def _worth_a_process(spec: Spec, networks: Hierarchy, demos: Demonstrations) -> bool:
-    """Whether training takes many steps, on a CPU and on demonstrations that are small and in memory."""
+    """Whether training takes long, on a CPU and on demonstrations that are small and in memory."""
     own, arrays = spec.training, [array for demo in demos for array in demo.observations.values()]
-    batches = 1 if _over_all(spec, networks) else math.ceil(len(demos) / own.batch_size)
-    steps = math.inf if own.epochs is None else own.epochs * batches
+    steps = math.inf if own.epochs is None else own.epochs * math.ceil(len(demos) / own.batch_size)
+    long = sum(map(len, demos)) >= MANY if _over_all(spec, networks) else steps >= LONG
     sizes = [array.nbytes if isinstance(array, np.ndarray) else math.inf for array in arrays]
-    return device_of(own).type == "cpu" and sum(sizes) < LITTLE and steps >= LONG
+    return device_of(own).type == "cpu" and sum(sizes) < LITTLE and long

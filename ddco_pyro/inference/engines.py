@@ -41,7 +41,7 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
     >>> from ddco_pyro.inference import log_likelihood
     >>> from ddco_pyro.model.tables import Tables
     >>> tables = Tables(  # one level of two options, which always end: log 0.5 and log 1 for each step
-    ...     selection=(torch.tensor([0.0, 0.5, 0.5]).log().expand(1, 4, 1, 3),),  # control, option 1, option 2
+    ...     selection=(torch.tensor([0.0, 0.5, 0.5]).log().expand(1, 4, 1, 3),),  # control, options 1, 2
     ...     termination=(torch.tensor([0.0, 1.0]).log().expand(1, 4, 2, 2),),  # 1 - ψ and ψ of both options
     ...     control=(torch.tensor([1.0, 3.0]).log().expand(1, 4, 2), torch.full((1, 4, 1), -torch.inf)),
     ... )

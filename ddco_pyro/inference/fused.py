@@ -108,8 +108,9 @@ def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool
             kernel.eliminate(
                 pad(lengths[chosen], (0, width - len(chosen))).numpy(), rows.flatten().numpy(),
                 found.flatten().numpy(), value.numpy(), exact.numpy(),
-                kernel.room_for(steps, number, gains, structure.entries), tables.power, tables.logits, gradient,
-                number, gains, structure.columns, *structure.tables, structure.groups, structure.inert,
+                kernel.room_for(steps, number, gains, structure.entries), tables.power, tables.logits,
+                gradient, number, gains, structure.columns, *structure.tables, structure.groups,
+                structure.inert,
             )  # fmt: skip
             return found, value, exact
 

@@ -41,7 +41,7 @@ TOLERANCE = 1e-9
 """Allowed error of Σ_s α_t(s) β_t(s) = 1. Rounding changes the sum by less than 1e-12 over 10 000 steps."""
 
 ROUNDED = 1e-7
-"""Products of the masses of steps between it and 1 / it are multiplied on: the logarithm of each takes longer."""
+"""Products of masses between it and 1 / it are multiplied on: a logarithm for each step takes longer."""
 
 SMALL, LARGE = 1e-300, 1e300
 """Mass of a step, and backward messages, beyond which a trajectory is done in log space."""
@@ -150,17 +150,18 @@ def on_threads(run: Callable[[int, int], Result], number: int, steps: int) -> li
 
 
 inner = numba.njit(error_model="numpy", fastmath={"contract"}, inline="always")
-entry: Callable[[Callable[..., None]], Callable[..., None]] = (
-    numba.njit(  # numba's own type knows no unpacking
-        error_model="numpy", fastmath={"contract"}, nogil=True, cache=True
-    )
+# numba's own type knows no unpacking
+entry: Callable[[Callable[..., None]], Callable[..., None]] = numba.njit(
+    error_model="numpy", fastmath={"contract"}, nogil=True, cache=True
 )
 
 # --- trajectories side by side ------------------------------------------------------------------------------
 
 LANES = 8
-TOGETHER = 32
 """Trajectories side by side: numbers of one vector instruction."""
+
+TOGETHER = 32
+"""Steps that are read together, one column after the other: far columns would not be in the cache in time."""
 
 ONE, ZERO, POWER, TOTAL, TERM, TOP, PRODUCT, FOUND, LEAST, WORST, FIXED = range(11)
 """Rows of a room with a meaning of their own."""
@@ -189,23 +190,24 @@ def lanewise(compute: Callable[..., Any]) -> Callable[[Array, int, int, int], No
 
 
 @intrinsic  # type: ignore[untyped-decorator]
-def move(typing: Any, into: Any, at: Any, source: Any, start: Any) -> Any:
+def _moved(typing: Any, into: Any, at: Any, source: Any, start: Any) -> Any:
     """Compiled: copy :data:`LANES` numbers of a flat array to a place of another."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
         vector = ir.VectorType(ir.DoubleType(), LANES).as_pointer()
-        places = [
-            builder.bitcast(
-                builder.gep(context.make_array(array)(context, builder, own).data, [place]), vector
-            )
-            for array, own, place in ((into, *arguments[:2]), (source, *arguments[2:]))
-        ]
-        builder.store(builder.load(places[1], align=8), places[0], align=8)
+
+        def place(array: Any, value: Any, index: Any) -> Any:
+            data = context.make_array(array)(context, builder, value).data
+            return builder.bitcast(builder.gep(data, [index]), vector)
+
+        numbers = builder.load(place(source, *arguments[2:]), align=8)
+        builder.store(numbers, place(into, *arguments[:2]), align=8)
         return context.get_dummy_value()
 
     return numba.void(into, numba.intp, source, numba.intp), generate
 
 
+move = cast(Callable[[Array, int, Array, int], None], _moved)
 FUSED = ("contract",)
 multiply = lanewise(lambda make, out, a, b: make.fmul(a, b, FUSED))
 accumulate = lanewise(lambda make, out, a, b: make.fadd(out, make.fmul(a, b, FUSED), FUSED))
@@ -219,7 +221,7 @@ smallest = lanewise(lambda make, out, a, b: make.select(make.fcmp_ordered("<", a
 
 @inner
 def _exponentials(room: Array, first: int, last: int) -> None:
-    """exp of the numbers of some rows, 0 below -708; relative error 2e-16. LLVM makes vector instructions of it."""
+    """exp of the numbers of some rows, 0 below -708; relative error 2e-16. LLVM vectorises it."""
     values = room[LANES * first : LANES * last]
     for i in range(len(values)):
         x = values[i]
@@ -248,20 +250,28 @@ def _lower(room: Array, first: int, number: int) -> None:
 
 
 @inner
-def _load(
-    room: Array, p: int, t: int, steps: int, first: int, lengths: Array, rows: Array, logits: bool, powered: bool,
-    number: int, columns: int, groups: Array, inert: Array, stride: int,
+def _read(
+    room: Array, p: int, stride: int, t: int, first: int, lengths: Array, rows: Array, number: int,
+    columns: int, inert: Array,
 ) -> None:  # fmt: skip
-    """Fill the probabilities at step t of a block. Past its end a trajectory keeps every choice."""
-    controls = groups[-1, 0]
-    if t % TOGETHER == 0:
-        for c in range(number):
-            for u in range(min(TOGETHER, steps - t)):
-                move(room, LANES * (p + u * stride + c), rows, (c * steps + t + u) * len(lengths) + first)
+    """Fill the logarithms of some steps of a block from t on. Past its end a trajectory keeps every choice.
+
+    :param p: row of the first of ``number`` logarithms at t; those of the next step are ``stride`` rows on.
+    """
+    steps = len(rows) // (number * len(lengths))
+    for c in range(number):
+        for u in range(min(TOGETHER, steps - t)):
+            move(room, LANES * (p + u * stride + c), rows, (c * steps + t + u) * len(lengths) + first)
     for lane in range(LANES):
-        if t >= lengths[first + lane]:
+        for u in range(max(lengths[first + lane] - t, 0), min(TOGETHER, steps - t)):
             for c in range(number):
-                room[LANES * (p + c) + lane] = inert[c] if c < columns else 0.0
+                room[LANES * (p + u * stride + c) + lane] = inert[c] if c < columns else 0.0
+
+
+@inner
+def _load(room: Array, p: int, number: int, columns: int, logits: bool, powered: bool, groups: Array) -> None:
+    """From logarithms at a step to probabilities."""
+    controls = groups[-1, 0]
     for c in range(p + controls, p + columns if powered else 0):
         multiply(room, c, c, POWER)
     for g in range(0 if logits else len(groups) - 1, len(groups)):
@@ -319,8 +329,8 @@ def _forward(room: Array, p: int, number: int, columns: int, t: int, callers: Ar
 
 @inner
 def _backward(
-    room: Array, p: int, number: int, columns: int, t: int, gain: int, gains: int, callers: Array, actors: Array,
-    choices: Array,
+    room: Array, p: int, number: int, columns: int, t: int, gain: int, gains: int, callers: Array,
+    actors: Array, choices: Array,
 ) -> None:  # fmt: skip
     """Adjoint of :func:`_forward`: the rows from :data:`FIXED` on go from β_t to β of t - 1. Fill ``gain``
     with the posteriors.
@@ -401,9 +411,9 @@ def eliminate(
             multiply(room, begin + number + i, ZERO if i < size - 1 else ONE, ONE)
         for t in range(longest):
             p = begin + t * stride
-            _load(
-                room, p, t, steps, first, lengths, rows, logits, power != 1.0, number, columns, groups, inert, stride
-            )  # fmt: skip
+            if t % TOGETHER == 0:
+                _read(room, p, stride, t, first, lengths, rows, number, columns, inert)
+            _load(room, p, number, columns, logits, power != 1.0, groups)
             _forward(room, p, number, columns, t, callers, actors)
             smallest(room, LEAST, LEAST, TOTAL)
             multiply(room, PRODUCT, PRODUCT, TOTAL)
@@ -470,7 +480,7 @@ def _plus(semiring: int, first: float, second: float) -> float:
 def _predict(
     semiring: int, t: int, n: int, rows: Array, messages: Array, spread: Array, callers: Array, actors: Array
 ) -> None:
-    """Fill ``messages[t]`` above level 1 and ``spread[t]``: the mass of each joint choice before the control at t."""
+    """Fill ``messages[t]`` above level 1 and ``spread[t]``: the mass of joint choices before the control."""
     last = len(callers) - 1
     if t > 0:
         for i in range(len(callers)):
@@ -511,7 +521,7 @@ def _act(
 
 @inner
 def _share(semiring: int, part: float, whole: float) -> float:
-    """The probability of a part of the mass, of logarithms; of a part of the maximum, 1 where it is the maximum."""
+    """The probability of a part of the mass, from logarithms; of the maximum, 1 where the part is it."""
     if semiring == LARGEST:
         return 1.0 if part == whole else 0.0
     return math.exp(part - whole)
@@ -565,8 +575,8 @@ def _back(
 @entry
 def trace(
     semiring: int, lengths: Array, rows: Array, uniforms: Array, predicted: Array, joint: Array, ended: Array,
-    possible: Array, messages: Array, spread: Array, columns: int, callers: Array, actors: Array, choices: Array,
-    above: Array,
+    possible: Array, messages: Array, spread: Array, columns: int, callers: Array, actors: Array,
+    choices: Array, above: Array,
 ) -> None:  # fmt: skip
     """Fill the ``joint`` choices [N, M, T] of M paths, and how many levels ``ended`` before each. Paths are
     the most likely one (:data:`LARGEST`), or draws from p(ζ | ξ) (:data:`LOG_SUM`).
@@ -591,14 +601,14 @@ def trace(
         possible[n] = total > -np.inf
         for m in range(joint.shape[1] if possible[n] else 0):
             _back(
-                semiring, total, m, n, lengths[n], rows, messages, spread, uniforms, joint, ended, callers, actors,
-                above,
+                semiring, total, m, n, lengths[n], rows, messages, spread, uniforms, joint, ended, callers,
+                actors, above,
             )  # fmt: skip
 
 
 @entry
 def products(x: Array, pairs: Array) -> None:
-    """The products of each two columns of x [B, F] into the rows of ``pairs``: the lower triangle, row by row."""
+    """The products of each two columns of x [B, F] into ``pairs``: the lower triangle, row by row."""
     for t in range(len(x)):
         place = 0
         for i in range(x.shape[1]):

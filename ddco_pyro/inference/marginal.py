@@ -1,4 +1,4 @@
-"""The AHMM with its latents eliminated: a Pyro distribution, and a Pyro program with priors on the weights."""
+"""The AHMM with its latents eliminated: a Pyro distribution, and a program with priors on the weights."""
 
 from __future__ import annotations
 

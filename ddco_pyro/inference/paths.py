@@ -21,7 +21,7 @@ from ddco_pyro.model.tables import Tables
 
 
 class Path(NamedTuple):
-    """Choices h and terminations b of every level, lowest first, each int64 [..., N, T]; -1 past the lengths."""
+    """Choices h and terminations b of each level, lowest first, int64 [..., N, T]; -1 past the lengths."""
 
     choices: tuple[Tensor, ...]
     terminations: tuple[Tensor, ...]
@@ -38,10 +38,11 @@ def most_likely_path(tables: Tables, lengths: Tensor) -> Path:
 
     >>> import torch
     >>> selection, ending = torch.tensor([0.0, 0.6, 0.4]).log(), torch.tensor([0.9, 0.1]).log()
+    >>> density = torch.tensor([[[-1.0, -3], [-1, -3], [-9, -1], [-9, -1]]])
     >>> tables = Tables(
     ...     selection=(selection.expand(1, 4, 1, 3),),  # control, option 1, option 2
     ...     termination=(ending.expand(1, 4, 2, 2),),  # 1 - ψ and ψ of both options
-    ...     control=(torch.tensor([[[-1.0, -3], [-1, -3], [-9, -1], [-9, -1]]]), torch.full((1, 4, 1), -torch.inf)),
+    ...     control=(density, torch.full((1, 4, 1), -torch.inf)),
     ... )
     >>> most_likely_path(tables, torch.tensor([4])).choices
     (tensor([[1, 1, 2, 2]]),)
@@ -117,7 +118,7 @@ def _trace(tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray)
 def _recursion(
     tables: Tables, lengths: Tensor, semiring: int, uniforms: np.ndarray, into: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """:func:`ddco_pyro.inference.kernel.trace` of all trajectories: joint choices, ended levels, what is possible."""
+    """Joint choices, ended levels and what is possible, by :func:`ddco_pyro.inference.kernel.trace`."""
     structure, uniforms = Structure.of(tables.sizes), np.ascontiguousarray(uniforms.swapaxes(0, 1))
     joint, ended = np.full((2, *uniforms.shape[:2], tables.steps), -1, dtype=np.int64)
     possible = np.empty(len(uniforms), dtype=np.bool_)
@@ -127,9 +128,10 @@ def _recursion(
         longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
         rows = rows_of(tables.part(torch.arange(first, last), longest).normalised())
         rows[controls] *= tables.power
+        by_trajectory = rows.permute(2, 1, 0).contiguous().numpy()
         room = np.empty((longest + 1, size)), np.empty((longest, size))
         kernel.trace(
-            semiring, lengths[own].numpy(), rows.permute(2, 1, 0).contiguous().numpy(), uniforms[own], into[own], joint[own], ended[own],
+            semiring, lengths[own].numpy(), by_trajectory, uniforms[own], into[own], joint[own], ended[own],
             possible[own], *room, structure.columns, *structure.tables,
         )  # fmt: skip
 

@@ -40,7 +40,7 @@ def posterior(tables: Tables, lengths: Tensor) -> Posterior:
     >>> from ddco_pyro.inference import posterior
     >>> from ddco_pyro.model.tables import Tables
     >>> tables = Tables(
-    ...     selection=(torch.tensor([0.0, 0.5, 0.5]).log().expand(1, 1, 1, 3),),  # control, option 1, option 2
+    ...     selection=(torch.tensor([0.0, 0.5, 0.5]).log().expand(1, 1, 1, 3),),  # control, options 1, 2
     ...     termination=(torch.tensor([0.0, 1.0]).log().expand(1, 1, 2, 2),),  # 1 - ψ and ψ of both options
     ...     control=(torch.tensor([1.0, 3.0]).log().expand(1, 1, 2), torch.full((1, 1, 1), -torch.inf)),
     ... )

@@ -1,1 +1,1 @@
-"""The model: the AHMM as a Pyro program, the networks of a hierarchy, and how observations and controls are encoded."""
+"""The model: the AHMM as a Pyro program, a hierarchy's networks, encoders of observations and controls."""

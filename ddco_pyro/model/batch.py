@@ -58,7 +58,7 @@ class Batch:
         return self.lengths.argsort(stable=True)
 
     def pieces(self, steps: int = STEPS_AT_ONCE) -> Iterator[tuple[Tensor, Batch]]:
-        """Parts of at most ``steps`` steps, padding included, or of a single demonstration, each with its rows."""
+        """Parts of at most ``steps`` steps with padding, or of one demonstration, each with its rows."""
         longest = int(self.lengths.max())
         for rows in torch.arange(len(self)).split(max(steps // longest, 1)):
             yield rows, self.select(rows) if len(rows) < len(self) else self
@@ -126,6 +126,7 @@ def refuse_unusable(
             step, column = np.argwhere(sizes > LARGEST_SCALED)[0]
             place = places[column] if column < len(places) else "actions"
             raise DemonstrationsError(
-                f"{demo.name}: {place} at step {step} is {sizes[step, column]:.2g} once it is scaled, and networks "
-                f"take at most {LARGEST_SCALED:g}; repair it, or leave {demo.name} out (demonstrations.exclude)"
+                f"{demo.name}: {place} at step {step} is {sizes[step, column]:.2g} once it is scaled, and "
+                f"networks take at most {LARGEST_SCALED:g}; repair it, or leave {demo.name} out "
+                "(demonstrations.exclude)"
             )

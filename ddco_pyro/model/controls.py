@@ -91,7 +91,7 @@ class ControlScaling(nn.Module):
 
     @property
     def numbers(self) -> int:
-        """How many numbers a network gives for a caller's control, without those of a σ (:class:`ControlStd`)."""
+        """How many numbers a network gives for a caller's control, without those of a σ."""
         return sum(KINDS[part.kind].size(part) for part in self.parts)
 
     @property
@@ -114,7 +114,7 @@ class ControlScaling(nn.Module):
                 self.scale[places] = torch.as_tensor(np.where(spread > 1e-9, spread, 1.0)[places])
 
     def scaled(self, actions: np.ndarray) -> np.ndarray:
-        """[T, A] in the control's own units to [T, A'] in scaled units; NaN for an unknown discrete action."""
+        """[T, A] in the control's units to [T, A'] in scaled units; NaN for an unknown discrete action."""
         scaled: np.ndarray = (self._exactly(actions) - self.shift.numpy()) / self.scale.numpy()
         for dims, part in zip(self.groups, self.parts, strict=True):
             if part.values:

@@ -20,7 +20,7 @@ from ddco_pyro.spec import STEP, ObservationSpec
 Shapes = Mapping[str, tuple[int, ...]]
 
 NARROWEST = 1e-6
-"""Least width of a bin that counts as a feature, as a part of the whole range; a narrower bin is only centred."""
+"""Least width of a bin that is a feature, as a part of the whole range; a narrower one is only centred."""
 
 
 class ObservationEncoder(nn.Module):
@@ -114,7 +114,10 @@ class ObservationEncoder(nn.Module):
         return any(spec.bins for spec in self.specs)
 
     def _places(self) -> np.ndarray:
-        """The feature of :meth:`features` behind each number that networks see, [F']: a key's own, then its bins'."""
+        """The feature of :meth:`features` behind each number that networks see, [F'].
+
+        A key's own come first, then those of its bins.
+        """
         firsts = np.cumsum([0, *self.given])
         rows = zip(self.specs, firsts, self.given, strict=False)
         return np.concatenate(
@@ -234,8 +237,8 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     )
     if last >= 0 and (len(stored) == PICTURE_DIMENSIONS or last >= size):
         raise ShapeError(
-            f"observations: {spec.key!r} has shape {list(stored)} at each step: angles and quaternions name numbers of "
-            f"a vector, counted from 0, and there is no number {last}"
+            f"observations: {spec.key!r} has shape {list(stored)} at each step: angles and quaternions name "
+            f"numbers of a vector, counted from 0, and there is no number {last}"
         )
     if spec.shift and len(stored) != PICTURE_DIMENSIONS:
         raise ShapeError(

@@ -211,7 +211,7 @@ class Hierarchy(nn.Module):
             )
 
     def place(self, device: torch.device) -> Hierarchy:
-        """Move the networks, and nothing else, to a device. Their callers give and get tensors on the host."""
+        """Move the networks alone to a device. Their callers give and get tensors on the host."""
         if device != self.device:
             _ = self.step_bytes  # counted on the host
             for network in self.networks().values():
@@ -244,7 +244,7 @@ class Hierarchy(nn.Module):
         return each | {"meta_policy": self.meta_policy.network}
 
     def begin_terminations(self, logit: float = 0.0) -> None:
-        """Have every ψ start at one value, 1/2 or that of a logit; those of a user's network keep their start."""
+        """Have every ψ start at 1/2, or at a logit's value; those of a user's network keep their start."""
         for level in self.option_levels():
             if level.termination is not None:
                 level.termination.begin_at(1, logit)
@@ -327,7 +327,7 @@ class Hierarchy(nn.Module):
     def _run_networks(
         self, inputs: Inputs, before: States | None, discovering: int | None = None, _: Tensor | None = None
     ) -> tuple[RawOutputs, dict[str, State]]:
-        """The networks' outputs, on the host, and their states after them, which stay on the networks' device."""
+        """The networks' outputs, on the host, and their states after them, on the networks' device."""
         inputs, states = inputs.loaded().to(self.device), before or self.initial_states(inputs.batch[0])
         after: dict[str, State] = {}
         raw: list[Tensor] = []

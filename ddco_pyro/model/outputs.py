@@ -13,7 +13,7 @@ from ddco_pyro.model.emissions import Emission
 from ddco_pyro.model.tables import NEVER, Tables, always_ending, by_step, by_trajectory, normalised
 
 TERMINATION_BOUND = 12.0
-"""Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6), so no path's probability is ever exactly 0."""
+"""Termination logits lie within ±12 (ψ between 6e-6 and 1 - 6e-6): no path's probability is exactly 0."""
 
 
 def bounded(logits: Tensor) -> Tensor:
@@ -52,7 +52,7 @@ class CallerOutputs:
 
     @property
     def choices(self) -> Tensor:
-        """Logits of η [N, T, K, 1 + k] of callers with options below them, -inf where control is impossible."""
+        """Logits of η [N, T, K, 1 + k] of callers with options below, -inf where control is impossible."""
         if self.logits is None:
             return pad(torch.zeros(*self.shape, 1), (0, self.options), value=NEVER)
         missing = 1 + self.options - self.logits.shape[-1]
@@ -104,11 +104,11 @@ class Outputs:
         return Tables((), self._endings, logits=True).normalised().termination
 
     def tables(self, actions: Tensor | None = None) -> Tables:
-        """The tables for controls [N, T, A] in scaled units; without them, of selections and terminations alone."""
+        """The tables for controls [N, T, A] in scaled units, or selections and terminations alone."""
         return self.logits(actions).normalised()
 
     def logits(self, actions: Tensor | None = None) -> Tables:
-        """The same tables before selections and terminations are normalised, as the fused engine takes them."""
+        """The same tables before selections and terminations are normalised, for the fused engine."""
         selection = tuple(caller.choices for caller in self.callers if caller.options)
         control = () if actions is None else tuple(caller.log_density(actions) for caller in self.callers)
         return Tables(selection, self._endings, control, power=float(self.power), logits=True)

@@ -1,4 +1,4 @@
-"""A recogniser of a level's options: logistic regression on windows of observations and controls around each step."""
+"""A recogniser of a level's options: logistic regression on windows of observations and controls."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Windows(nn.Module):
         )
 
     def latest(self, rows: Sequence[Tensor]) -> Tensor:
-        """The features [3 F] of the last of consecutive steps, from x of each [F]; for a regression on the past."""
+        """The features [3 F] of the last of consecutive steps from x of each [F]: those of the past."""
         return torch.cat(
             [rows[-1], *(torch.stack([*rows[-1 - width :]]).mean(0) for width in self.widths.tolist())]
         )

@@ -126,7 +126,7 @@ class Tables:
         return replace(self, termination=tuple(always_ending(table.shape[:-1]) for table in self.termination))
 
     def apart(self) -> tuple[Tables, Tables]:
-        """These tables with a uniform meta-policy, and these tables with a gradient for the meta-policy alone."""
+        """These tables with a uniform meta-policy, and with a gradient for the meta-policy alone."""
         *lower, top = self.selection
         uniform = torch.full_like(top, -math.log(top.shape[-1] - 1))
         uniform[..., 0] = NEVER
@@ -135,7 +135,7 @@ class Tables:
         return levels, replace(fixed, selection=(*fixed.selection[:-1], top))
 
     def part(self, rows: Tensor, steps: int) -> Tables:
-        """The first steps of the trajectories ``rows`` [M] alone; without a copy where these stand side by side."""
+        """The first steps of the trajectories ``rows`` [M]; no copy where these are consecutive."""
         chosen = consecutive(rows)
         return self.map(lambda table: table[chosen, :steps])
 
@@ -292,7 +292,7 @@ def _keep_past_the_end(termination: Tensor, alive: Tensor) -> Tensor:
 
 
 def joint_density(control: Sequence[Tensor]) -> Tensor:
-    """log π(a_t | h^D_t, ..., h^1_t) float64 [N, T, C_D, ..., C_1]: the lowest level whose choice is not 0 acts."""
+    """log π(a_t | h^D_t, ..., h^1_t) float64 [N, T, C_D, ..., C_1]; the lowest level with an option acts."""
     depth = len(control) - 1
     emission = control[-1].double().squeeze(-1)
     for level in range(depth, 0, -1):

@@ -45,9 +45,9 @@ if TYPE_CHECKING:
     from ddco_pyro.training.prior import Prior
 
 LARGEST = 3.0
-"""The most that a weight of a logit changes in a step: Fisher scoring overshoots where a logistic curve is flat."""
+"""The most that a weight of a logit changes in a step: where the curve is flat, Fisher scoring overshoots."""
 GROWTH = 1.3
-"""The ratio of a step's stretch to that of the last one, where that one raised the penalised log-likelihood."""
+"""The ratio of a step's stretch to the last one's, where that raised the penalised log-likelihood."""
 FARTHEST = 8.0
 """The most that a step is stretched."""
 HALVINGS = 10
@@ -284,7 +284,7 @@ class Expectation:
 
     @property
     def converged(self) -> bool:
-        """Whether each of the last two steps gained less than :data:`TOLERANCE`, or roughly: than :data:`ROUGHLY`."""
+        """Whether each of the last two steps gained less than :data:`TOLERANCE` (or :data:`ROUGHLY`)."""
         return self.gain < (ROUGHLY if self._roughly else TOLERANCE)
 
     def objective(self, batch: Batch) -> float:
@@ -372,7 +372,7 @@ class Expectation:
         return total
 
     def _prior_count(self, weight: Tensor) -> int:
-        """How many numbers a mean's prior N(W0, σ²/ρ) is of: the weights, with the bias where a library has one."""
+        """How many numbers a mean's prior N(W0, σ²/ρ) is of: the weights, and the bias of a library."""
         return weight.shape[1] - (self._bias == BIAS) if self._ridge.policy else 0
 
     def _penalties(self, away: Tensor, ridge: float) -> Tensor:
@@ -380,7 +380,7 @@ class Expectation:
         return (_ridges(away.shape[1], ridge, self._bias).unsqueeze(-1) * away.square()).sum(1)
 
     def _expect(self, batch: Batch) -> tuple[float, float, dict[str, Sums]]:
-        """The E-step: the score, also penalised, and the sums that the M-step solves for each trained network."""
+        """The E-step: the score, also penalised, and the sums for the M-step of each trained network."""
         total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
         if not self._pieces:
             order = batch.by_length[:: math.ceil(batch.steps / MOST) if self._roughly else 1]

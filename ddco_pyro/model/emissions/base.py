@@ -140,7 +140,7 @@ class Emission(ABC):
         """log π(a_d | s) of each caller and dimension of controls [..., A], [..., K, A]."""
 
     def log_density(self, actions: Tensor) -> Tensor:
-        """log π(a | s) [..., K]: dimensions are independent given the caller, unless a kind says otherwise."""
+        """log π(a | s) [..., K]: dimensions are independent given the caller, by default."""
         return over_dimensions(self.by_dimension(actions))
 
     @property
@@ -165,18 +165,16 @@ class Emission(ABC):
         """
 
     def steps(self) -> list[Self]:
-        """One emission for each step: tensors with as many dimensions as the first field differ from step to step."""
+        """One emission for each step: tensors with the first field's dimensions differ between steps."""
         each = self._fields()
         dimensions = next(iter(each.values())).dim()
-        by_step = {
+        varying = {
             name: value.unbind(1) if isinstance(value, Tensor) else value.steps()
             for name, value in each.items()
             if isinstance(value, Emission) or value.dim() == dimensions
         }
-        return [
-            replace(self, **dict(zip(by_step, now, strict=True)))
-            for now in zip(*by_step.values(), strict=True)
-        ]  # type: ignore[type-var]
+        steps = (dict(zip(varying, now, strict=True)) for now in zip(*varying.values(), strict=True))
+        return [replace(self, **step) for step in steps]  # type: ignore[type-var]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The emission of changed tensors."""

@@ -18,7 +18,7 @@ from ddco_pyro.model.tables import NEVER
 
 
 def of_switch(first: Tensor, second: Tensor) -> Tensor:
-    """The divergence ½ (p_i - p_j)(y_i - y_j) of two switches, also where torch's own is infinite by rounding."""
+    """The divergence ½ (p_i - p_j)(y_i - y_j) of two switches; torch's own may be infinite by rounding."""
     return 0.5 * (first.sigmoid() - second.sigmoid()) * (first - second)
 
 

@@ -75,7 +75,7 @@ class Hurdle(Emission):
             yield own.moved(1, 0)
 
     def by_dimension(self, actions: Tensor) -> Tensor:
-        """log π(a_d | s), [..., K, A]: each dimension has an equal share of the log-probability of the part."""
+        """log π(a_d | s), [..., K, A], each with an equal share of the part's log-probability."""
         at = _at_value(actions).unsqueeze(-1)
         return self._part(at) / self.shape[-1] + torch.where(at, 0.0, self.slab.by_dimension(actions))
 
@@ -93,7 +93,7 @@ class Hurdle(Emission):
         return torch.where(self.logit >= 0, 0.0, self.slab.mode)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """The value where Φ(z) of the last number is less than p; elsewhere what the slab draws from the others."""
+        """The value where Φ(z) of the last number is below p, elsewhere what the slab draws."""
         at = ndtr(noise[..., -1:]).unsqueeze(-2) < self.logit.sigmoid()
         return torch.where(at, 0.0, self.slab.draw(noise[..., :-1]))
 

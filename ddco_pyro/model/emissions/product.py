@@ -51,7 +51,7 @@ class Product(Emission):
         return sum(emission.noise for _, emission in self.groups)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """The controls that standard normal numbers stand for: one for each dimension, then those that groups add."""
+        """The controls of standard normal numbers: one for each dimension, then those that groups add."""
         draws, first = [], self.shape[-1]
         for dimensions, emission in self.groups:
             last = first + emission.noise - len(dimensions)
