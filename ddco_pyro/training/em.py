@@ -244,6 +244,7 @@ class Expectation:
         enough.
     :param prior: that of a library, in place of the ridges; None without one.
     :ivar steps: steps of the demonstrations that are learned from, once the first step has begun.
+    :ivar parts: these demonstrations in pieces, with their features; none where they are to be cut again.
     :ivar value: the penalised log-likelihood of the weights that the last step began at.
     :ivar gain: the larger gain of the last two steps, nats per step; a stretched one that gains nothing may
         have gone too far.
@@ -279,7 +280,7 @@ class Expectation:
             if caller.std is not None
         }
         self._before: dict[str, Tensor] | None = None
-        self._pieces: list[tuple[Tensor, Batch, dict[tuple[str, ...], Features]]] = []
+        self.parts: list[tuple[Tensor, Batch, dict[tuple[str, ...], Features]]] = []
         self.value, self.gain, self.stretch, self._last = -math.inf, math.inf, 1.0, math.inf
 
     @property
@@ -382,11 +383,11 @@ class Expectation:
     def _expect(self, batch: Batch) -> tuple[float, float, dict[str, Sums]]:
         """The E-step: the score, also penalised, and the sums for the M-step of each trained network."""
         total, sums = 0.0, {name: Sums() for name, network in self._networks.items() if network.trained}
-        if not self._pieces:
+        if not self.parts:
             order = batch.by_length[:: math.ceil(batch.steps / MOST) if self._roughly else 1]
-            self._pieces = [(*part, {}) for part in batch.parts(order, self.model.steps_at_once)]
+            self.parts = [(*part, {}) for part in batch.parts(order, self.model.steps_at_once)]
             self.steps = int(batch.lengths[order].sum())
-        for piece in self._pieces:
+        for piece in self.parts:
             total += self._expect_piece(*piece, sums)
         return total, total + self._penalty(sums), sums
 

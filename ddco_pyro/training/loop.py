@@ -27,7 +27,6 @@ from ddco_pyro.model.batch import Batch, Parts
 from ddco_pyro.model.hierarchy import Hierarchy
 from ddco_pyro.model.seeding import seed as seed_generators
 from ddco_pyro.model.seeding import seeded
-from ddco_pyro.model.tables import Tables
 from ddco_pyro.training.checkpoint import Restart, State, TrainingData, copy_of
 from ddco_pyro.training.em import Expectation
 from ddco_pyro.training.objective import Diverged, Objective
@@ -80,7 +79,7 @@ def train(
                     if last and until is not None and now.epoch >= until:
                         now.sounded = stage.reached()
                         if stage.whole is not None:
-                            restart.paused = stage
+                            restart.paused, stage.whole.parts = stage, []  # cut again where it goes on
                             return restart
                         states |= stage.states()
                         return restart.written(checkpoint)
@@ -130,7 +129,7 @@ class StageTraining:
         optimizer = optimizer_of(self.spec.optimizer, model)
         if optimizer == "em":
             settings = (self.spec.optimizer.ridge, stage.discovering, not last, data.library)
-            self.whole = Expectation(model, stage.trained, self._score, *settings)
+            self.whole = Expectation(model, stage.trained, self.objective.score, *settings)
         elif optimizer == "lbfgs":
             gradient = partial(backward, self.objective)
             self.whole = QuasiNewton(model, gradient, self.spec.optimizer.weight_decay)
@@ -196,9 +195,6 @@ class StageTraining:
         ended = EpochEnded(now.restart, self.stage.name, now.epoch, total / steps, tune)
         now.history.append(asdict(ended))
         return ended
-
-    def _score(self, tables: Tables, piece: Batch, rows: Tensor) -> Tensor:
-        return self.objective.values(self.objective.clamped(tables, rows), piece.lengths).sum()
 
     def _gradient_steps(self, place: tuple[int, int, int]) -> float:
         """A gradient step on each minibatch; the log-likelihood on the way, nats.
@@ -269,8 +265,9 @@ class StageTraining:
         train, restart = self.data.train, self.restart
         model = self.data.hierarchy(restart.progress.restart, restart.states["best"])
         if isinstance(self.whole, Expectation):
-            ridge, library = self.spec.optimizer.ridge, self.data.library
-            score = Expectation(model, EVERYTHING, self._score, ridge, prior=library).objective(train)
+            ridge, prior = self.spec.optimizer.ridge, self.data.library
+            whole = Expectation(model, EVERYTHING, self.objective.score, ridge, prior=prior)
+            score = whole.objective(train)
         else:
             with torch.no_grad():
                 score = 0.0

@@ -128,6 +128,13 @@ class Objective:
             tables = tables.with_evidence(level, evidence[rows, : tables.steps])
         return tables
 
+    def score(self, tables: Tables, piece: Batch, rows: Tensor) -> Tensor:
+        """The objective of a piece of the training demonstrations from its tables, nats.
+
+        :param rows: of the demonstrations, [N].
+        """
+        return self.values(self.clamped(tables, rows), piece.lengths).sum()
+
     def values(self, tables: Tables, lengths: Tensor) -> Tensor:
         """The objective of each demonstration, nats, [N] in float64.
 

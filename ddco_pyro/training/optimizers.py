@@ -106,6 +106,7 @@ class QuasiNewton:
     :param backward: adds the gradient of minus the log-likelihood per step; the log-likelihood, nats.
     :param decay: L2 penalty.
     :ivar steps: steps of the demonstrations, once the first step has begun.
+    :ivar parts: the demonstrations in pieces; none where they are to be cut again.
     """
 
     def __init__(self, model: Hierarchy, backward: Callable[[Hierarchy, Parts], float], decay: float) -> None:
@@ -117,7 +118,7 @@ class QuasiNewton:
             tolerance_change=0.0, line_search_fn="strong_wolfe",
         )  # fmt: skip
         self._evaluated: list[tuple[Tensor, float, float, list[Tensor]]] = []
-        self._parts: Parts = []
+        self.parts: Parts = []
 
     @property
     def converged(self) -> bool:
@@ -126,8 +127,8 @@ class QuasiNewton:
 
     def step(self, batch: Batch) -> float:
         """One step, always over the same demonstrations; their log-likelihood before it, nats."""
-        if not self._parts:
-            self._parts = batch.parts(batch.by_length, self.model.steps_at_once)
+        if not self.parts:
+            self.parts = batch.parts(batch.by_length, self.model.steps_at_once)
             self.steps = batch.steps
         loss, value = self._evaluate()
         self._optimizer.step(lambda: self._evaluate()[0])
@@ -142,7 +143,7 @@ class QuasiNewton:
         if evaluation is None:
             self._optimizer.zero_grad()
             with torch.enable_grad():
-                value = self._backward(self.model, self._parts)
+                value = self._backward(self.model, self.parts)
             gradients = [p.grad + self._decay * p.detach() for p in self._parameters if p.grad is not None]
             loss = 0.5 * self._decay * float(weights @ weights) - value / self.steps
             evaluation = weights, loss, value, gradients

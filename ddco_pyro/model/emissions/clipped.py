@@ -45,12 +45,11 @@ class Clipped(Gaussian):
         """log N(a_d; μ_d, σ_d²) within the bounds, log Φ of what lies beyond on a bound, [..., K, A]."""
         errors, before = self._errors(actions.clamp(self.low, self.high)), actions.dim() - 1
         each = by_step(self._scored(errors), before)
-        side = (actions <= self.low).float() - (actions >= self.high).float()
-        side = by_step(side, before).flatten()
-        place = side.nonzero().squeeze(1)  # log Φ is computed on bounds alone, for each caller
-        places = (place + len(side) * torch.arange(len(each)).unsqueeze(1)).flatten()
+        low, high = (by_step(on, before).flatten() for on in (actions <= self.low, actions >= self.high))
+        place = (low ^ high).nonzero().squeeze(1)  # log Φ is computed on bounds alone, for each caller
+        places = (place + len(low) * torch.arange(len(each)).unsqueeze(1)).flatten()
         beyond = by_step(errors, before).flatten().index_select(0, places)
-        mass = LogNormal.apply(beyond * side.index_select(0, place).repeat(len(each)))
+        mass = LogNormal.apply(torch.where(low[place].repeat(len(each)), beyond, -beyond))
         return by_trajectory(each.flatten().index_copy(0, places, mass).view(each.shape), before)
 
     @property
