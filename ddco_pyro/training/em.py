@@ -101,7 +101,7 @@ class Features:
         pairs = np.empty((1 + BLOCK // number, number))
         found = np.zeros((len(each), number))
         for block in (slice(first, first + len(pairs)) for first in range(0, len(x), len(pairs))):
-            rows = x[block].astype(np.float64)
+            rows = np.ascontiguousarray(x[block], np.float64)
             products(rows, pairs)
             found += each[:, block] @ pairs[: len(rows)]  # torch's own takes twice as long
         lower = torch.tril_indices(features, features)
