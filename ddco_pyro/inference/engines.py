@@ -50,8 +50,9 @@ def log_likelihood(tables: Tables, lengths: Tensor, engine: Engine = "fused") ->
     """
     if engine == "enumerate":
         return enumerated(tables, lengths)
-    if lengths.device.type == "cpu":
-        return fused.log_likelihood(tables, lengths)
+    if lengths.device.type == "cpu" and tables.depth:  # else nothing is latent
+        settings = tables.depth, tables.power, tables.logits
+        return fused.Eliminate.apply(*settings, lengths, *tables.leaves())  # type: ignore[no-any-return]
     return logspace.log_likelihood(complete(tables, lengths))
 
 

@@ -45,7 +45,7 @@ class Eliminate(torch.autograd.Function):
     ) -> Tensor:
         """log p(ξ), [N]."""
         tables = Tables.of(depth, leaves, power, logits)
-        found = _eliminated(tables, lengths, any(ctx.needs_input_grad[3 * depth + 5 :]), gradient=True)
+        found = posteriors(tables, lengths, any(ctx.needs_input_grad[3 * depth + 5 :]), gradient=True)
         ctx.rows, ctx.depth = found.rows, depth
         ctx.save_for_backward(*leaves)
         return found.value
@@ -75,33 +75,21 @@ class Eliminate(torch.autograd.Function):
         return None, None, None, None, *gradients
 
 
-def log_likelihood(tables: Tables, lengths: Tensor) -> Tensor:
-    """log p(ξ), [N] float64, of tables on the CPU."""
-    if not tables.depth:
-        return logspace.log_likelihood(complete(tables, lengths))  # nothing is latent
-    value: Tensor = Eliminate.apply(tables.depth, tables.power, tables.logits, lengths, *tables.leaves())
-    return value
-
-
-def posteriors(tables: Tables, lengths: Tensor, marginals: bool = False) -> Elimination:
-    """Log-likelihoods and the posteriors of tables on the CPU, without a gradient.
+def posteriors(
+    tables: Tables, lengths: Tensor, marginals: bool = False, gradient: bool = False
+) -> Elimination:
+    """Log-likelihoods and the posteriors of tables on the CPU.
 
     :param marginals: whether those of the choices are wanted, too.
+    :param gradient: whether derivatives of log p(ξ) by the tables' entries take the posteriors' place.
     """
-    return _eliminated(tables, lengths, marginals, gradient=False)
-
-
-def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool) -> Elimination:
-    """The posteriors, or the derivatives of log p(ξ) with respect to the tables' entries."""
     with torch.no_grad():
         structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.argsort(stable=True)
         gains = structure.columns + (sum(tables.sizes) if marginals else 0)
 
         def some(first: int, last: int) -> tuple[Tensor, ...]:
             chosen = order[first * lanes : last * lanes]
-            rows = rows_of(tables.part(chosen, tables.steps))
-            if len(chosen) < lanes:
-                rows = pad(rows, (0, lanes - len(chosen)))
+            rows = rows_of(tables.part(chosen, tables.steps), (last - first) * lanes)
             number, steps, width = rows.shape
             found = torch.empty(gains, steps, width, dtype=torch.float64)
             value, exact = torch.empty(width, dtype=torch.float64), torch.empty(width, dtype=torch.bool)
@@ -124,11 +112,20 @@ def _eliminated(tables: Tables, lengths: Tensor, marginals: bool, gradient: bool
     return elimination
 
 
-def rows_of(tables: Tables) -> Tensor:
-    """The tables of all levels and the joint evidence as they are, float64 [columns, T, N]."""
+def rows_of(tables: Tables, width: int) -> Tensor:
+    """The tables of all levels and the joint evidence as they are, float64 [columns, T, width].
+
+    :param width: at least N; there are zeros behind.
+    """
     evidence = tables.joint_evidence()
     each = [*_in_order(tables), *([] if evidence is None else [evidence])]
-    return torch.cat([by_step(table.detach()).flatten(0, -3) for table in each]).double()
+    each = [by_step(table.detach()).flatten(0, -3) for table in each]
+    rows = torch.empty(sum(map(len, each)), *each[0].shape[1:2], width, dtype=torch.float64)
+    number = each[0].shape[2]
+    rows[..., number:] = 0
+    for into, table in zip(rows.split([*map(len, each)]), each, strict=True):
+        into[..., :number] = table
+    return rows
 
 
 def _in_order(tables: Tables) -> list[Tensor]:

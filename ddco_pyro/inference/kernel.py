@@ -386,8 +386,8 @@ def eliminate(
     Each step is scaled to a mass of 1. Underflow there matters only where the past makes next to impossible
     what the future demands. Then Σ_s α_t(s) β_t(s) is not 1, and the trajectory is not ``exact``.
 
-    :param lengths: of the trajectories, [N], at least :data:`LANES`; 0 where there is none. Those of a block
-        should be about as long. The last block has some of the block before again.
+    :param lengths: of the trajectories, [N], N a multiple of :data:`LANES`; 0 where there is none. Those of a
+        block should be about as long.
     :param rows: ``number`` columns of log-probabilities, a flat [number, T, N]; of selections and
         terminations logits where ``logits`` says so.
     :param posterior: a flat [gains, T, N], or the derivative of log p(ξ) with respect to ``rows``, where
@@ -399,8 +399,8 @@ def eliminate(
     gain, begin, stride, controls = FIXED + size, FIXED + size + gains, number + 2 * size + 1, groups[-1, 0]
     for i in range(LANES):
         room[LANES * ONE + i], room[LANES * ZERO + i], room[LANES * POWER + i] = 1.0, 0.0, power
-    for block in range((len(lengths) + LANES - 1) // LANES):
-        first, longest = min(block * LANES, len(lengths) - LANES), 0
+    for first in range(0, len(lengths), LANES):
+        longest = 0
         for lane in range(LANES):
             longest = max(longest, lengths[first + lane])
         multiply(room, FOUND, ZERO, ZERO)

@@ -126,7 +126,7 @@ def _recursion(
 
     def some(first: int, last: int) -> None:
         longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
-        rows = rows_of(tables.part(torch.arange(first, last), longest).normalised())
+        rows = rows_of(tables.part(torch.arange(first, last), longest).normalised(), last - first)
         rows[controls] *= tables.power
         by_trajectory = rows.permute(2, 1, 0).contiguous().numpy()
         room = np.empty((longest + 1, size)), np.empty((longest, size))

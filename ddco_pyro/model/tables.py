@@ -96,10 +96,8 @@ class Tables:
         total: Tensor | None = None
         for level, evidence in enumerate(self.evidence, start=1):
             if evidence is not None:
-                shape = (
-                    evidence.shape[:2] + (1,) * (self.depth - level) + evidence.shape[2:] + (1,) * (level - 1)
-                )
-                own = evidence.double().reshape(shape)
+                above, below = (1,) * (len(self.evidence) - level), (1,) * (level - 1)
+                own = evidence.double().reshape(*evidence.shape[:2], *above, -1, *below)
                 total = own if total is None else total + own
         return None if total is None else total.expand(*total.shape[:2], *reversed(self.sizes))
 
