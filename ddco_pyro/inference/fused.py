@@ -11,6 +11,7 @@ from __future__ import annotations
 from functools import reduce
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -87,41 +88,46 @@ def posteriors(
         structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.argsort(stable=True)
         gains = structure.columns + (sum(tables.sizes) if marginals else 0)
 
-        def some(first: int, last: int) -> tuple[Tensor, ...]:
-            chosen = order[first * lanes : last * lanes]
-            rows = rows_of(tables.part(chosen, tables.steps), (last - first) * lanes)
+        found = torch.empty(gains, tables.steps, -(-len(order) // lanes) * lanes, dtype=torch.float64)
+        value, exact = (
+            torch.empty(found.shape[2], dtype=torch.float64),
+            torch.empty(found.shape[2], dtype=torch.bool),
+        )
+
+        def some(first: int, last: int) -> None:
+            its = slice(first * lanes, last * lanes)
+            rows = rows_of(tables.part(order[its], tables.steps), its.stop - its.start)
             number, steps, width = rows.shape
-            found = torch.empty(gains, steps, width, dtype=torch.float64)
-            value, exact = torch.empty(width, dtype=torch.float64), torch.empty(width, dtype=torch.bool)
             kernel.eliminate(
-                pad(lengths[chosen], (0, width - len(chosen))).numpy(), rows.flatten().numpy(),
-                found.flatten().numpy(), value.numpy(), exact.numpy(),
+                pad(lengths[order[its]], (0, width - len(order[its]))).numpy(), rows.flatten().numpy(),
+                found.flatten()[its.start :].numpy(), found.shape[2], value[its].numpy(), exact[its].numpy(),
                 kernel.room_for(steps, number, gains, structure.entries), tables.power, tables.logits,
                 gradient, number, gains, structure.columns, *structure.tables, structure.groups,
                 structure.inert,
             )  # fmt: skip
-            return found, value, exact
 
-        parts = zip(*kernel.on_threads(some, -(-len(order) // lanes), int(lengths.sum())), strict=True)
-        each = (part[0] if len(part) == 1 else torch.cat(part, -1) for part in parts)
+        kernel.on_threads(some, found.shape[2] // lanes, int(lengths.sum()))
         place = slice(len(order)) if bool((order.diff() == 1).all()) else order.argsort()
-        found, value, exact = (part[..., place] for part in each)
+        found, value, exact = (each[..., place] for each in (found, value, exact))
         elimination = Elimination(value, *_split(tables, found, marginals), found)
     for n in (~exact).nonzero().flatten().tolist():
         _repeat_in_log_space(tables, n, int(lengths[n]), elimination, gradient)
     return elimination
 
 
-def rows_of(tables: Tables, width: int) -> Tensor:
+def rows_of(tables: Tables, width: int, alone: bool = False) -> Tensor:
     """The tables of all levels and the joint evidence as they are, float64 [columns, T, width].
 
     :param width: at least N; there are zeros behind.
+    :param alone: whether the numbers of each step stand side by side in memory, instead of trajectories.
     """
     evidence = tables.joint_evidence()
     each = [*_in_order(tables), *([] if evidence is None else [evidence])]
     each = [by_step(table.detach()).flatten(0, -3) for table in each]
-    rows = torch.empty(sum(map(len, each)), *each[0].shape[1:2], width, dtype=torch.float64)
-    number = each[0].shape[2]
+    columns, (_, steps, number) = sum(map(len, each)), each[0].shape
+    shape = (width, steps, columns) if alone else (columns, steps, width)
+    rows = torch.empty(shape, dtype=torch.float64)
+    rows = by_step(rows) if alone else rows
     rows[..., number:] = 0
     for into, table in zip(rows.split([*map(len, each)]), each, strict=True):
         into[..., :number] = table

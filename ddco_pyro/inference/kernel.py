@@ -23,7 +23,7 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import numba
 import numpy as np
@@ -32,7 +32,6 @@ from llvmlite import ir
 from numba.extending import intrinsic
 
 Array = np.ndarray
-Result = TypeVar("Result")
 
 IMPOSSIBLE = -1
 """Marks a joint choice with an option below a choice 0, and a caller that is itself below a choice 0."""
@@ -48,6 +47,9 @@ SMALL, LARGE = 1e-300, 1e300
 
 STEPS_A_THREAD = 4096
 """Steps of trajectories that are worth a thread of their own."""
+
+STEPS_A_PART = 16384
+"""Steps of a part of the work, at most, or one unit: its rows are memory that the part before had."""
 
 
 class Structure(NamedTuple):
@@ -128,8 +130,8 @@ def _offsets(sizes: Sequence[int]) -> Array:
     return np.cumsum([0, *sizes])
 
 
-def on_threads(run: Callable[[int, int], Result], number: int, steps: int) -> list[Result]:
-    """What ``run(first, last)`` returns for parts of ``number`` units of work, on at most
+def on_threads(run: Callable[[int, int], object], number: int, steps: int) -> None:
+    """Call ``run(first, last)`` for parts of ``number`` units of work, on at most
     ``torch.get_num_threads()`` threads.
 
     torch itself works on one thread meanwhile: its own threads wait busily, and these would wait for them.
@@ -138,13 +140,15 @@ def on_threads(run: Callable[[int, int], Result], number: int, steps: int) -> li
     """
     most = torch.get_num_threads()
     threads = min(most, number, 1 + steps // STEPS_A_THREAD)
+    parts = min(number, max(threads, -(-steps // STEPS_A_PART)))
+    bounds = [number * part // parts for part in range(parts + 1)]
     if threads == 1:
-        return [run(0, number)]
-    bounds = [number * part // threads for part in range(threads + 1)]
+        list(map(run, bounds[:-1], bounds[1:]))
+        return
     torch.set_num_threads(1)
     try:
         with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(run, bounds[:-1], bounds[1:]))
+            list(pool.map(run, bounds[:-1], bounds[1:]))
     finally:
         torch.set_num_threads(most)
 
@@ -377,9 +381,9 @@ def _backward(
 
 @entry
 def eliminate(
-    lengths: Array, rows: Array, posterior: Array, value: Array, exact: Array, room: Array, power: float,
-    logits: bool, gradient: bool, number: int, gains: int, columns: int, callers: Array, actors: Array,
-    choices: Array, above: Array, groups: Array, inert: Array,
+    lengths: Array, rows: Array, posterior: Array, width: int, value: Array, exact: Array, room: Array,
+    power: float, logits: bool, gradient: bool, number: int, gains: int, columns: int, callers: Array,
+    actors: Array, choices: Array, above: Array, groups: Array, inert: Array,
 ) -> None:  # fmt: skip
     """Fill ``value``, ``exact`` and the posteriors, with :data:`LANES` trajectories in a block.
 
@@ -390,8 +394,8 @@ def eliminate(
         block should be about as long.
     :param rows: ``number`` columns of log-probabilities, a flat [number, T, N]; of selections and
         terminations logits where ``logits`` says so.
-    :param posterior: a flat [gains, T, N], or the derivative of log p(ξ) with respect to ``rows``, where
-        ``gradient`` says so.
+    :param posterior: these trajectories' place in a flat [gains, T, ``width``], or that of the derivative of
+        log p(ξ) with respect to ``rows``, where ``gradient`` says so.
     :param value: log p(ξ), [N]; ``exact`` likewise.
     :param room: of :func:`room_for`.
     """
@@ -441,10 +445,10 @@ def eliminate(
                 for c in range(gains if t >= lengths[first + lane] else 0):
                     room[LANES * (gain + c) + lane] = 0.0
             for c in range(gains):
-                move(posterior, (c * steps + t) * len(lengths) + first, room, LANES * (gain + c))
+                move(posterior, (c * steps + t) * width + first, room, LANES * (gain + c))
         for t in range(longest, steps):
             for c in range(gains):
-                move(posterior, (c * steps + t) * len(lengths) + first, room, LANES * ZERO)
+                move(posterior, (c * steps + t) * width + first, room, LANES * ZERO)
         for lane in range(LANES):
             n, most = first + lane, 0.0
             for i in range(size):  # an overflow at t = 0 shows nowhere else

@@ -17,7 +17,7 @@ from ddco_pyro.inference import kernel
 from ddco_pyro.inference.arguments import refuse_impossible
 from ddco_pyro.inference.fused import rows_of
 from ddco_pyro.inference.kernel import Structure
-from ddco_pyro.model.tables import Tables
+from ddco_pyro.model.tables import Tables, by_trajectory
 
 
 class Path(NamedTuple):
@@ -126,13 +126,13 @@ def _recursion(
 
     def some(first: int, last: int) -> None:
         longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
-        rows = rows_of(tables.part(torch.arange(first, last), longest).normalised(), last - first)
+        its = tables.part(torch.arange(first, last), longest).normalised()
+        rows = rows_of(its, last - first, alone=True)
         rows[controls] *= tables.power
-        by_trajectory = rows.permute(2, 1, 0).contiguous().numpy()
         room = np.empty((longest + 1, size)), np.empty((longest, size))
         kernel.trace(
-            semiring, lengths[own].numpy(), by_trajectory, uniforms[own], into[own], joint[own], ended[own],
-            possible[own], *room, structure.columns, *structure.tables,
+            semiring, lengths[own].numpy(), by_trajectory(rows).numpy(), uniforms[own], into[own], joint[own],
+            ended[own], possible[own], *room, structure.columns, *structure.tables,
         )  # fmt: skip
 
     kernel.on_threads(some, len(lengths), int(lengths.sum()))
