@@ -11,7 +11,6 @@ from __future__ import annotations
 from functools import reduce
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -87,28 +86,25 @@ def posteriors(
     with torch.no_grad():
         structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.argsort(stable=True)
         gains = structure.columns + (sum(tables.sizes) if marginals else 0)
-
-        found = torch.empty(gains, tables.steps, -(-len(order) // lanes) * lanes, dtype=torch.float64)
-        value, exact = (
-            torch.empty(found.shape[2], dtype=torch.float64),
-            torch.empty(found.shape[2], dtype=torch.bool),
-        )
+        blocks, steps = -(-len(order) // lanes), tables.steps
+        written = torch.empty(gains, steps, blocks * lanes, dtype=torch.float64)
+        values, sure = written.new_empty(blocks * lanes), written.new_empty(blocks * lanes, dtype=torch.bool)
 
         def some(first: int, last: int) -> None:
             its = slice(first * lanes, last * lanes)
-            rows = rows_of(tables.part(order[its], tables.steps), its.stop - its.start)
-            number, steps, width = rows.shape
+            chosen, width = order[its], its.stop - its.start
+            rows = rows_of(tables.part(chosen, steps), width)
             kernel.eliminate(
-                pad(lengths[order[its]], (0, width - len(order[its]))).numpy(), rows.flatten().numpy(),
-                found.flatten()[its.start :].numpy(), found.shape[2], value[its].numpy(), exact[its].numpy(),
-                kernel.room_for(steps, number, gains, structure.entries), tables.power, tables.logits,
-                gradient, number, gains, structure.columns, *structure.tables, structure.groups,
+                pad(lengths[chosen], (0, width - len(chosen))).numpy(), rows.flatten().numpy(),
+                written.flatten()[its.start :].numpy(), blocks * lanes, values[its].numpy(),
+                sure[its].numpy(), kernel.room_for(steps, len(rows), gains, structure.entries), tables.power,
+                tables.logits, gradient, len(rows), gains, structure.columns, *structure.tables, structure.groups,
                 structure.inert,
             )  # fmt: skip
 
-        kernel.on_threads(some, found.shape[2] // lanes, int(lengths.sum()))
+        kernel.on_threads(some, blocks, int(lengths.sum()))
         place = slice(len(order)) if bool((order.diff() == 1).all()) else order.argsort()
-        found, value, exact = (each[..., place] for each in (found, value, exact))
+        found, value, exact = (each[..., place] for each in (written, values, sure))
         elimination = Elimination(value, *_split(tables, found, marginals), found)
     for n in (~exact).nonzero().flatten().tolist():
         _repeat_in_log_space(tables, n, int(lengths[n]), elimination, gradient)
