@@ -17,8 +17,8 @@ from ddco_pyro.model.tables import consecutive, part
 
 STEPS_AT_ONCE = 12288
 """Most steps of a piece of a batch; fewer where a step takes much memory
-(:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`). Memory stays bounded, and the cache holds most of
-what a piece needs. Of long trajectories fewer steps would leave lanes of the pass empty."""
+(:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`). Memory stays bounded, and the cache holds most
+of what a piece needs. Of long trajectories fewer steps would leave lanes of the pass empty."""
 
 LARGEST_SCALED = 1e12
 """Largest feature or control in scaled units. The squares of what networks make of it, divided by that of a
