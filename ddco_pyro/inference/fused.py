@@ -112,7 +112,8 @@ def posteriors(
 
 
 def rows_of(tables: Tables, width: int, alone: bool = False) -> Tensor:
-    """The tables of all levels and the joint evidence as they are, float64 [columns, T, width].
+    """The tables of all levels and the joint evidence as they are, float64 [columns, T, width]; in memory
+    that the next call in this thread has.
 
     :param width: at least N; there are zeros behind.
     :param alone: whether the numbers of each step stand side by side in memory, instead of trajectories.
@@ -122,7 +123,7 @@ def rows_of(tables: Tables, width: int, alone: bool = False) -> Tensor:
     each = [by_step(table.detach()).flatten(0, -3) for table in each]
     columns, (_, steps, number) = sum(map(len, each)), each[0].shape
     shape = (width, steps, columns) if alone else (columns, steps, width)
-    rows = torch.empty(shape, dtype=torch.float64)
+    rows = torch.from_numpy(kernel.memory("rows", columns * steps * width)).view(shape)
     rows = by_step(rows) if alone else rows
     rows[..., number:] = 0
     for into, table in zip(rows.split([*map(len, each)]), each, strict=True):

@@ -20,6 +20,7 @@ slices.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -48,8 +49,14 @@ SMALL, LARGE = 1e-300, 1e300
 STEPS_A_THREAD = 4096
 """Steps of trajectories that are worth a thread of their own."""
 
-STEPS_A_PART = 16384
-"""Steps of a part of the work, at most, or one unit: its rows are memory that the part before had."""
+_kept = threading.local()
+
+
+def memory(name: str, numbers: int) -> Array:
+    """Room for so many numbers that this thread keeps: new memory in each pass would take as long as the pass."""
+    if len(getattr(_kept, name, ())) < numbers:
+        setattr(_kept, name, np.empty(numbers))
+    return cast(Array, getattr(_kept, name)[:numbers])
 
 
 class Structure(NamedTuple):
@@ -140,11 +147,10 @@ def on_threads(run: Callable[[int, int], object], number: int, steps: int) -> No
     """
     most = torch.get_num_threads()
     threads = min(most, number, 1 + steps // STEPS_A_THREAD)
-    parts = min(number, max(threads, -(-steps // STEPS_A_PART)))
-    bounds = [number * part // parts for part in range(parts + 1)]
     if threads == 1:
-        list(map(run, bounds[:-1], bounds[1:]))
+        run(0, number)
         return
+    bounds = [number * part // threads for part in range(threads + 1)]
     torch.set_num_threads(1)
     try:
         with ThreadPoolExecutor(threads) as pool:
@@ -463,7 +469,7 @@ def eliminate(
 
 def room_for(steps: int, columns: int, gains: int, entries: int) -> Array:
     """Room for :func:`eliminate` over T steps: rows of a step, and of its posteriors, and M messages."""
-    return np.empty(LANES * (FIXED + entries + gains + (steps + 1) * (columns + 2 * entries + 1)))
+    return memory("room", LANES * (FIXED + entries + gains + (steps + 1) * (columns + 2 * entries + 1)))
 
 
 # --- trajectories alone, in logarithms ----------------------------------------------------------------------
