@@ -53,7 +53,7 @@ _kept = threading.local()
 
 
 def memory(name: str, numbers: int) -> Array:
-    """Room for so many numbers that this thread keeps: new memory in each pass would take as long as the pass."""
+    """Room for so many numbers that this thread keeps: new memory in each pass takes as long as the pass."""
     if len(getattr(_kept, name, ())) < numbers:
         setattr(_kept, name, np.empty(numbers))
     return cast(Array, getattr(_kept, name)[:numbers])
