@@ -97,7 +97,7 @@ def posteriors(
             kernel.eliminate(
                 pad(lengths[chosen], (0, width - len(chosen))).numpy(), rows.flatten().numpy(),
                 written.flatten()[its.start :].numpy(), blocks * lanes, values[its].numpy(),
-                sure[its].numpy(), kernel.room_for(steps, len(rows), gains, structure.entries),
+                sure[its].numpy(), kernel.room_for(steps, len(rows), structure.entries),
                 tables.power, tables.logits, gradient, len(rows), gains, structure.columns,
                 *structure.tables, structure.groups, structure.inert,
             )  # fmt: skip

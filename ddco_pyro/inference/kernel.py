@@ -171,7 +171,7 @@ LANES = 8
 """Trajectories side by side: numbers of one vector instruction."""
 
 TOGETHER = 32
-"""Steps that are read together, one column after the other: far columns would not be in the cache in time."""
+"""Steps that are read or written together, column after column: far columns come too late to the cache."""
 
 ONE, ZERO, POWER, TOTAL, TERM, TOP, PRODUCT, FOUND, LEAST, WORST, FIXED = range(11)
 """Rows of a room with a meaning of their own."""
@@ -406,7 +406,7 @@ def eliminate(
     :param room: of :func:`room_for`.
     """
     size, steps = len(above) + 1, len(rows) // (number * len(lengths))
-    gain, begin, stride, controls = FIXED + size, FIXED + size + gains, number + 2 * size + 1, groups[-1, 0]
+    begin, stride, controls = FIXED + size, number + 2 * size + 1, groups[-1, 0]
     for i in range(LANES):
         room[LANES * ONE + i], room[LANES * ZERO + i], room[LANES * POWER + i] = 1.0, 0.0, power
     for first in range(0, len(lengths), LANES):
@@ -435,7 +435,7 @@ def eliminate(
         for i in range(size):
             multiply(room, FIXED + i, ONE, ONE)
         for t in range(longest - 1, -1, -1):
-            p = begin + t * stride
+            p, gain = begin + t * stride, begin + (t + 2) * stride
             _backward(room, p, number, columns, t, gain, gains, callers, actors, choices)
             subtract(room, TERM, TOTAL, ONE)
             accumulate(room, WORST, TERM, TERM)
@@ -450,8 +450,11 @@ def eliminate(
             for lane in range(LANES):
                 for c in range(gains if t >= lengths[first + lane] else 0):
                     room[LANES * (gain + c) + lane] = 0.0
-            for c in range(gains):
-                move(posterior, (c * steps + t) * width + first, room, LANES * (gain + c))
+            if t % TOGETHER == 0:
+                for c in range(gains):
+                    for u in range(min(TOGETHER, longest - t)):
+                        place = (c * steps + t + u) * width + first
+                        move(posterior, place, room, LANES * (gain + u * stride + c))
         for t in range(longest, steps):
             for c in range(gains):
                 move(posterior, (c * steps + t) * width + first, room, LANES * ZERO)
@@ -467,9 +470,11 @@ def eliminate(
             exact[n] = within and most <= LARGE and abs(value[n]) < np.inf
 
 
-def room_for(steps: int, columns: int, gains: int, entries: int) -> Array:
-    """Room for :func:`eliminate` over T steps: rows of a step, and of its posteriors, and M messages."""
-    return memory("room", LANES * (FIXED + entries + gains + (steps + 1) * (columns + 2 * entries + 1)))
+def room_for(steps: int, columns: int, entries: int) -> Array:
+    """Room for :func:`eliminate` over T steps: rows of each step, and M messages. The posteriors of a step
+    take the place of the next step but one.
+    """
+    return memory("room", LANES * (FIXED + entries + (steps + 2) * (columns + 2 * entries + 1)))
 
 
 # --- trajectories alone, in logarithms ----------------------------------------------------------------------
