@@ -190,14 +190,18 @@ def test_after_another_process_is_killed_one_process_goes_on_to_the_same_bits(wh
     assert_same_run(tmp_path / "run", run)
 
 
-LABELS = {"level": "level-1", "from": "phase", "count": 3, "recogniser": "cross_validated"}
+LABELS = {"level": "level-1", "from": "phase", "recogniser": "cross_validated"}
 MOMENTUM = {"optimizer": {"name": "momentum"}, "average": 0.9}
 
 
 @pytest.mark.slow  # the two processes above stand for torchrun's
 @pytest.mark.parametrize(("number", "training"), [(2, {}), (3, MOMENTUM), (2, {"labels": LABELS})])
 def test_processes_of_torchrun_give_the_bits_of_one(demos, tmp_path, number, training):
-    phases = (replace(demo, labels={"phase": np.arange(len(demo)) * 2 // len(demo)}) for demo in demos)
+    each = (
+        np.arange(len(demo)) * 2 // len(demo) if n < 3 else np.full(len(demo), -1)
+        for n, demo in enumerate(demos)
+    )
+    phases = (replace(demo, labels={"phase": own}) for demo, own in zip(demos, each, strict=True))
     replace(demos, demonstrations=tuple(phases)).write(tmp_path / "demos.hdf5")
     short = make_spec(tmp_path / "demos.hdf5", patience=None, epochs=4, starts=["vq"], **training)
     (tmp_path / "spec.yaml").write_text(dump_spec(short))
