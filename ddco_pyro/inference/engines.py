@@ -120,10 +120,8 @@ def enumerated(
     chain = complete(tables, lengths)
     unused = ~chain.alive[..., None, None]  # may hold NaN
     chain = replace(chain, selection=tuple(table.masked_fill(unused, 0.0) for table in chain.selection))
-    with (
-        pyro.poutine.enum(first_available_dim=-2),
-        pyro.poutine.trace() as traced,
-    ):  # the plate has dimension -1
+    # the plate has dimension -1
+    with pyro.poutine.enum(first_available_dim=-2), pyro.poutine.trace() as traced:
         ahmm(chain, emissions, actions)
     trace = traced.trace
     trace.compute_log_prob()

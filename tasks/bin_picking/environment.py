@@ -142,9 +142,9 @@ class BinPicking(base.Task):
         ``image`` uint8 [72, 72, 2]: masks of the objects, 0 and 255, of the left and the right eye; ``grasp``
         [6]: the trial's candidate, column and row (pixels of 288) in the left and the right picture, cosine
         and sine of the gripper's turn; ``kin`` [7]: position (mm) and rotation vector (rad) of the gripper as
-        the encoders give them, with kinematic error, and the angle between the jaws (rad), which objects
-        between them keep from closing; ``load`` [18]: the shape of what the left mask, as it was rendered,
-        has where loads are shown (:func:`ddco_tasks.bin_picking.shape.described`).
+        the encoders give them, with kinematic error, and the angle between the jaws (rad), which an object
+        holds open; ``load`` [18]: the shape in the part of the left mask that shows a load, at 288 pixels a
+        side (:func:`ddco_tasks.bin_picking.shape.described`).
         """
         reported = psm.forward(physics.encoders())
         turn = psm.rotation_vector(reported.rotation)

@@ -156,7 +156,7 @@ def test_aligned_jaws_alone_grasp(environment: Environment, offset: tuple[float,
 
 
 def insert_with_offset(environment: Environment, sideways_mm: float, turn: float) -> dict[str, float]:
-    """The measures after a true grasp and an insertion with the right heading and height but for offsets."""
+    """The measures after a true grasp and an insertion whose heading and height are off by these offsets."""
     assert grasp_with_offset(environment)
     target = environment.physics.target() + np.array([0.0, 1e-3 * sideways_mm, 0.0])
     into = geometry.insertion_pose(environment.physics.grip(), target)
