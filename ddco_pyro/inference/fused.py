@@ -8,16 +8,17 @@ them.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from functools import reduce
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from ddco_pyro.inference import kernel, logspace
-from ddco_pyro.inference.kernel import Structure
-from ddco_pyro.model.tables import Tables, by_step, by_trajectory, complete
+from ddco_pyro.inference.kernel import Array, Structure
+from ddco_pyro.model.tables import Tables, by_trajectory, complete
 
 
 class Elimination(NamedTuple):
@@ -25,15 +26,27 @@ class Elimination(NamedTuple):
     trajectory's end.
 
     :param value: log p(ξ), [N].
-    :param tables: the posterior of each table's entries, in the tables' shapes; without evidence.
-    :param marginals: of the choices of each level, [N, T, C_d]; empty where they are not wanted.
-    :param rows: tables and marginals one after the other, [columns, T, N].
+    :param rows: posteriors of tables, and marginals, one after the other, [columns, T, N].
+    :param of: the tables.
     """
 
     value: Tensor
-    tables: Tables
-    marginals: tuple[Tensor, ...]
     rows: Tensor
+    of: Tables
+
+    @property
+    def tables(self) -> Tables:
+        """The posterior of each table's entries, in the tables' shapes; without evidence."""
+        each, depth = [*_parts(self.rows, _shapes(self.of))], self.of.depth
+        control = *each[2 * depth + 1 :], each[2 * depth]
+        return Tables((*each[:depth],), (*each[depth : 2 * depth],), control)
+
+    @property
+    def marginals(self) -> tuple[Tensor, ...]:
+        """Of the choices of each level, [N, T, C_d]; none where they were not wanted."""
+        shapes = _shapes(self.of)
+        rows = self.rows[sum(map(torch.Size.numel, shapes)) :]
+        return (*_parts(rows, [torch.Size([size]) for size in self.of.sizes]),) if len(rows) else ()
 
 
 class Eliminate(torch.autograd.Function):
@@ -66,8 +79,8 @@ class Eliminate(torch.autograd.Function):
         tables = Tables.of(ctx.depth, leaves)
         widest = reduce(torch.promote_types, (leaf.dtype for leaf in leaves if leaf is not None))
         rows = ctx.rows.to(widest) * upstream.to(widest)
-        parts, marginals = _split(tables, rows, any(needed[3 * ctx.depth + 1 :]))
-        each = *parts.leaves(), *(marginals or tables.evidence)
+        found = Elimination(upstream, rows, tables)
+        each = *found.tables.leaves(), *(found.marginals or tables.evidence)
         gradients = (
             part.to(leaf.dtype) if want and part is not None else None
             for part, leaf, want in zip(each, leaves, needed, strict=True)
@@ -83,51 +96,53 @@ def posteriors(
     :param marginals: whether those of the choices are wanted, too.
     :param gradient: whether derivatives of log p(ξ) by the tables' entries take the posteriors' place.
     """
-    with torch.no_grad():
-        structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.argsort(stable=True)
-        gains = structure.columns + (sum(tables.sizes) if marginals else 0)
-        blocks, steps = -(-len(order) // lanes), tables.steps
-        written = torch.empty(gains, steps, blocks * lanes, dtype=torch.float64)
-        values, sure = written.new_empty(blocks * lanes), written.new_empty(blocks * lanes, dtype=torch.bool)
+    structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.numpy().argsort(kind="stable")
+    gains = structure.columns + (sum(tables.sizes) if marginals else 0)
+    blocks, steps = -(-len(order) // lanes), tables.steps
+    written = torch.empty(gains, steps, blocks * lanes, dtype=torch.float64)
+    values, sure = torch.empty(blocks * lanes, dtype=torch.float64), np.empty(blocks * lanes, bool)
+    consecutive = bool((order[1:] > order[:-1]).all())
+    each = numbers_of(tables)
 
-        def some(first: int, last: int) -> None:
-            its = slice(first * lanes, last * lanes)
-            chosen, width = order[its], its.stop - its.start
-            rows = rows_of(tables.part(chosen, steps), width)
-            kernel.eliminate(
-                pad(lengths[chosen], (0, width - len(chosen))).numpy(), rows.flatten().numpy(),
-                written.flatten()[its.start :].numpy(), blocks * lanes, values[its].numpy(),
-                sure[its].numpy(), kernel.room_for(steps, len(rows), structure.entries),
-                tables.power, tables.logits, gradient, len(rows), gains, structure.columns,
-                *structure.tables, structure.groups, structure.inert,
-            )  # fmt: skip
+    def some(first: int, last: int) -> None:
+        its = slice(first * lanes, last * lanes)
+        chosen, width = its if consecutive else order[its], its.stop - its.start
+        own = np.zeros(width, np.int64)
+        own[: len(order[its])] = lengths.numpy()[chosen]
+        rows = joined([table[..., chosen] for table in each], width)
+        kernel.eliminate(
+            own, rows.ravel(), written.numpy().ravel()[its.start :], blocks * lanes, values.numpy()[its],
+            sure[its], kernel.room_for(steps, len(rows), structure.entries), tables.power, tables.logits,
+            gradient, len(rows), gains, structure.columns, *structure.tables, structure.groups,
+            structure.inert,
+        )  # fmt: skip
 
-        kernel.on_threads(some, blocks, int(lengths.sum()))
-        place = slice(len(order)) if bool((order.diff() == 1).all()) else order.argsort()
-        found, value, exact = (each[..., place] for each in (written, values, sure))
-        elimination = Elimination(value, *_split(tables, found, marginals), found)
-    for n in (~exact).nonzero().flatten().tolist():
+    kernel.on_threads(some, blocks, int(lengths.sum()))
+    place = slice(len(order)) if consecutive else order.argsort()
+    elimination = Elimination(values[place], written[..., place], tables)
+    for n in (~sure[place]).nonzero()[0].tolist():
         _repeat_in_log_space(tables, n, int(lengths[n]), elimination, gradient)
     return elimination
 
 
-def rows_of(tables: Tables, width: int, alone: bool = False) -> Tensor:
-    """The tables of all levels and the joint evidence as they are, float64 [columns, T, width]; in memory
-    that the next call in this thread has.
-
-    :param width: at least N; there are zeros behind.
-    :param alone: whether the numbers of each step stand side by side in memory, instead of trajectories.
-    """
+def numbers_of(tables: Tables) -> list[Array]:
+    """The tables of all levels and, where there is any, the joint evidence, as they are: [columns, T, N]."""
     evidence = tables.joint_evidence()
     each = [*_in_order(tables), *([] if evidence is None else [evidence])]
-    each = [by_step(table.detach()).flatten(0, -3) for table in each]
+    numbers = (table.detach().numpy() for table in each)
+    return [own.transpose(*range(2, own.ndim), 1, 0).reshape(-1, *own.shape[1::-1]) for own in numbers]
+
+
+def joined(each: Sequence[Array], width: int) -> Array:
+    """Numbers of tables one after the other, float64 [columns, T, width]; in memory that the next call in
+    this thread has.
+
+    :param width: at least N; there are zeros behind.
+    """
     columns, (_, steps, number) = sum(map(len, each)), each[0].shape
-    shape = (width, steps, columns) if alone else (columns, steps, width)
-    rows = torch.from_numpy(kernel.memory("rows", columns * steps * width)).view(shape)
-    rows = by_step(rows) if alone else rows
+    rows = kernel.memory("rows", columns * steps * width).reshape(columns, steps, width)
     rows[..., number:] = 0
-    for into, table in zip(rows.split([*map(len, each)]), each, strict=True):
-        into[..., :number] = table
+    np.concatenate(each, out=rows[..., :number])
     return rows
 
 
@@ -136,19 +151,18 @@ def _in_order(tables: Tables) -> list[Tensor]:
     return [*tables.selection, *tables.termination, meta_policy, *levels]
 
 
-def _split(tables: Tables, rows: Tensor, marginals: bool) -> tuple[Tables, tuple[Tensor, ...]]:
-    """Rows of posteriors as tables in the shapes of these ones, and the marginals of each level."""
-    each = _in_order(tables)
-    sizes = [*(table.shape[2:].numel() for table in each), *(tables.sizes if marginals else ())]
-    parts = [by_trajectory(part) for part in rows.split(sizes)]
-    shaped = [part.unflatten(2, table.shape[2:]) for part, table in zip(parts, each, strict=False)]
-    depth = tables.depth
-    return (
-        Tables(
-            (*shaped[:depth],), (*shaped[depth : 2 * depth],), (*shaped[2 * depth + 1 :], shaped[2 * depth])
-        ),
-        tuple(parts[len(each) :]),
-    )
+def _shapes(tables: Tables) -> list[torch.Size]:
+    """What a step has of each table."""
+    return [table.shape[2:] for table in _in_order(tables)]
+
+
+def _parts(rows: Tensor, shapes: Iterable[torch.Size]) -> Iterator[Tensor]:
+    """The first rows of [columns, T, N] in these shapes, [N, T, *shape] each."""
+    first, numbers = 0, rows.numpy()  # whose views take a tenth of torch's time
+    for shape in shapes:
+        part = numbers[first : first + shape.numel()]
+        yield by_trajectory(torch.from_numpy(part.reshape(*shape, *part.shape[1:])))
+        first += shape.numel()
 
 
 def _repeat_in_log_space(

@@ -53,9 +53,12 @@ _kept = threading.local()
 
 
 def memory(name: str, numbers: int) -> Array:
-    """Room for so many numbers that this thread keeps: new memory in each pass takes as long as the pass."""
+    """Room for so many numbers that this thread keeps: new memory in each pass takes as long as the pass.
+
+    torch's begins where a line of the cache does, numpy's does not: each vector would lie in two lines.
+    """
     if len(getattr(_kept, name, ())) < numbers:
-        setattr(_kept, name, np.empty(numbers))
+        setattr(_kept, name, torch.empty(numbers, dtype=torch.float64).numpy())
     return cast(Array, getattr(_kept, name)[:numbers])
 
 

@@ -6,6 +6,7 @@ after the other, O(D + Σ C_d) a step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,9 +16,9 @@ from torch import Tensor
 
 from ddco_pyro.inference import kernel
 from ddco_pyro.inference.arguments import refuse_impossible
-from ddco_pyro.inference.fused import rows_of
+from ddco_pyro.inference.fused import numbers_of
 from ddco_pyro.inference.kernel import Structure
-from ddco_pyro.model.tables import Tables, by_trajectory
+from ddco_pyro.model.tables import Tables
 
 
 class Path(NamedTuple):
@@ -127,11 +128,13 @@ def _recursion(
     def some(first: int, last: int) -> None:
         longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
         its = tables.part(torch.arange(first, last), longest).normalised()
-        rows = rows_of(its, last - first, alone=True)
-        rows[controls] *= tables.power
+        each = [table.T for table in numbers_of(its)]  # the numbers of a step side by side
+        shape = last - first, longest, sum(table.shape[-1] for table in each)
+        rows = np.concatenate(each, -1, kernel.memory("rows", math.prod(shape)).reshape(shape))
+        rows[..., controls] *= tables.power
         room = np.empty((longest + 1, size)), np.empty((longest, size))
         kernel.trace(
-            semiring, lengths[own].numpy(), by_trajectory(rows).numpy(), uniforms[own], into[own], joint[own],
+            semiring, lengths[own].numpy(), rows, uniforms[own], into[own], joint[own],
             ended[own], possible[own], *room, structure.columns, *structure.tables,
         )  # fmt: skip
 
