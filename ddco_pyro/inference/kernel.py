@@ -51,6 +51,10 @@ STEPS_A_THREAD = 4096
 
 _kept = threading.local()
 
+# The C library keeps free memory up to twice the largest block that was given back, and a step of training
+# makes and frees its tensors anew: to have them cleared by the system each time takes a fifth of the step.
+torch.empty(2**25 - 2**16, dtype=torch.uint8)
+
 
 def memory(name: str, numbers: int) -> Array:
     """Room for so many numbers that this thread keeps: new memory in each pass takes as long as the pass.
