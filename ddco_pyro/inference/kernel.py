@@ -629,11 +629,14 @@ def trace(
 
 
 @entry
-def products(x: Array, pairs: Array) -> None:
-    """The products of each two columns of x [B, F] into ``pairs``: the lower triangle, row by row."""
-    for t in range(len(x)):
-        place = 0
-        for i in range(x.shape[1]):
-            for j in range(i + 1):
-                pairs[t, place + j] = x[t, i] * x[t, j]
-            place += i + 1
+def products(x: Array, first: int, pairs: Array) -> None:
+    """The products of each two rows of x [F, T], from a column on, into ``pairs`` [F·(F + 1) / 2, B]: the
+    lower triangle, row by row.
+    """
+    place, last = 0, first + pairs.shape[1]
+    for i in range(len(x)):
+        for j in range(i + 1):
+            one, other, both = x[i, first:last], x[j, first:last], pairs[place]
+            for t in range(len(one)):
+                both[t] = np.float64(one[t]) * np.float64(other[t])
+            place += 1

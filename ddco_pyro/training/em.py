@@ -23,6 +23,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -58,11 +59,12 @@ ROUGHLY = 1e-3
 """The same in a stage whose end is a start alone."""
 MOST = 100_000
 """The most steps that such a stage learns from, of demonstrations spread evenly over their lengths."""
-BLOCK = 65536
-"""Products of features that are computed at once: they stay in the cache."""
+BLOCK, NARROWEST = 65536, 16
+"""Products of features that are computed at once: they stay in the cache. The least steps of them."""
 BIAS = 1e-6
 """Ridge of biases, and the least of weights: an option that is never active keeps its own."""
 
+Array = np.ndarray
 Score = Callable[[Tables, Batch, Tensor], Tensor]
 """What is maximised of a piece of the demonstrations, nats: its tables, itself, and its rows."""
 
@@ -80,44 +82,50 @@ class Features:
         self.shape = vectors.shape[1:]
         self.x = torch.cat([vectors, torch.ones(1, *self.shape)]).flatten(1)
 
-    def outputs(self, weights: Sequence[Tensor]) -> list[Tensor]:
+    def outputs(self, weights: Sequence[Array]) -> list[Tensor]:
         """W^T x of networks with weights [K, F, n] each: [N, T, K, n] each."""
-        said = torch.cat([own.mT.flatten(0, 1) for own in weights]).to(self.x) @ self.x
-        parts = _parts(said.unflatten(1, self.shape), [own.shape[::2] for own in weights])
-        return [by_trajectory(part) for part in parts]
+        rows = np.concatenate([own.swapaxes(1, 2).reshape(-1, len(self.x)) for own in weights])
+        said = (torch.from_numpy(rows).to(self.x) @ self.x).numpy()
+        parts = _parts(said.reshape(-1, *self.shape), [own.shape[::2] for own in weights])
+        return [by_trajectory(torch.from_numpy(part)) for part in parts]
 
-    def gradients(self, of: Sequence[Tensor]) -> list[Tensor]:
+    def gradients(self, of: Sequence[Tensor]) -> list[Array]:
         """Σ_t x_t g_t^T of the gradients of the outputs of networks, [N, T, K, n] each: [K, F, n] each."""
-        sums = (self.x @ self._side_by_side(of).T).T.double()
-        return [part.mT for part in _parts(sums, [own.shape[2:] for own in of])]
+        sums = (self.x @ self._side_by_side(of).T).T.double().numpy()
+        return [part.swapaxes(1, 2) for part in _parts(sums, [own.shape[2:] for own in of])]
 
-    def moments(self, weights: Sequence[Tensor]) -> list[Tensor]:
+    def moments(self, weights: Sequence[Tensor]) -> list[Array]:
         """Σ_t h_t x_t x_t^T of weights h [N, T, K, n], none below 0: [K, n, F, F] each."""
         from ddco_pyro.inference.kernel import products  # and numba and pyro, which not every command needs
 
-        features = len(self.x)
-        each, x = self._side_by_side(weights).double().numpy(), self.x.T.numpy()
-        number = features * (features + 1) // 2
-        pairs = np.empty((1 + BLOCK // number, number))
+        each, x = self._side_by_side(weights).double().numpy(), self.x.numpy()
+        number = len(x) * (len(x) + 1) // 2
+        pairs = np.empty((number, max(NARROWEST, BLOCK // number)))
         found = np.zeros((len(each), number))
-        for block in (slice(first, first + len(pairs)) for first in range(0, len(x), len(pairs))):
-            rows = np.ascontiguousarray(x[block], np.float64)
-            products(rows, pairs)
-            found += each[:, block] @ pairs[: len(rows)]  # torch's own takes twice as long
-        lower = torch.tril_indices(features, features)
-        whole = torch.empty(len(found), features, features, dtype=torch.float64)
-        whole[:, *lower] = whole[:, *lower.flip(0)] = torch.from_numpy(found)
-        return _parts(whole, [own.shape[2:] for own in weights])
+        for first in range(0, x.shape[1], pairs.shape[1]):
+            own = each[:, first : first + pairs.shape[1]]
+            products(x, first, pairs)
+            found += own @ pairs[:, : own.shape[1]].T  # torch's own takes twice as long
+        return _parts(found.take(_places(len(x)), 1), [own.shape[2:] for own in weights])
 
     def _side_by_side(self, each: Sequence[Tensor]) -> Tensor:
         """Numbers of networks, [N, T, K, n] or [N, T, K] each, one after the other: [columns, T·N]."""
         return torch.cat([by_step(own).reshape(-1, self.x.shape[1]) for own in each])
 
 
-def _parts(columns: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:
+def _parts(columns: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     """Numbers of networks that stand one after the other, [columns, ...], in these shapes [*shape, ...]."""
-    parts = columns.split([shape.numel() for shape in shapes])
-    return [part.unflatten(0, shape) for part, shape in zip(parts, shapes, strict=True)]
+    ends = [*accumulate(map(math.prod, shapes), initial=0)]
+    parts = (columns[first:last] for first, last in pairwise(ends))
+    return [part.reshape(*shape, *part.shape[1:]) for part, shape in zip(parts, shapes, strict=True)]
+
+
+@cache
+def _places(features: int) -> Array:
+    """Where a symmetric matrix [F, F] has each entry in its lower triangle, row by row."""
+    places, lower = np.empty((features, features), np.int64), np.tril_indices(features)
+    places[lower] = places[lower[::-1]] = np.arange(len(lower[0]))
+    return places
 
 
 @dataclass
@@ -130,16 +138,16 @@ class Sums:
         many controls it stands for, [K].
     """
 
-    gradient: Tensor | float = 0.0
-    std: Tensor | float = 0.0
-    groups: dict[int, tuple[Information, Tensor, Tensor]] = field(default_factory=dict)
+    gradient: Array | float = 0.0
+    std: Array | float = 0.0
+    groups: dict[int, tuple[Information, Array, Array]] = field(default_factory=dict)
 
-    def add_information(self, group: Information, moments: Tensor) -> None:
+    def add_information(self, group: Information, moments: Array) -> None:
         """Add that of a piece from the moments of its weights."""
         _, information, count = self.groups.get(group.columns.start, (None, 0.0, 0.0))
         information = information + moments
         number = group.weight if group.count is None else group.count
-        self.groups[group.columns.start] = group, information, count + number.sum((0, 1))
+        self.groups[group.columns.start] = group, information, count + number.sum((0, 1)).numpy()
 
 
 class Linear:
@@ -155,18 +163,18 @@ class Linear:
         self.ridge, self.trained, self.reads = ridge, trained, tuple(cast(Mlp, network).reads)
         self.layer = _layer(network)
         self.weight = _weight(self.layer)
-        self._center = torch.zeros_like(self.weight) if library is None else _weight(_layer(library))
+        self._center = np.zeros_like(self.weight) if library is None else _weight(_layer(library))
 
     @property
-    def away(self) -> Tensor:
+    def away(self) -> Array:
         """The weights, from the centre of their prior."""
         return self.weight - self._center
 
     def store(self) -> None:
         """Give the network these weights."""
         with torch.no_grad():
-            self.layer.weight.copy_(self.weight[:, :-1])
-            self.layer.bias.copy_(self.weight[:, -1:])
+            self.layer.weight.copy_(torch.from_numpy(self.weight[:, :-1]))
+            self.layer.bias.copy_(torch.from_numpy(self.weight[:, -1:]))
 
 
 def _layer(network: nn.Module) -> StackedLinear:
@@ -174,8 +182,8 @@ def _layer(network: nn.Module) -> StackedLinear:
     return cast(StackedLinear, cast(Mlp, network).layers[0])
 
 
-def _weight(layer: StackedLinear) -> Tensor:
-    return torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double().cpu()
+def _weight(layer: StackedLinear) -> Array:
+    return torch.cat([layer.weight.detach(), layer.bias.detach()], dim=1).double().cpu().numpy()
 
 
 class Std:
@@ -190,7 +198,8 @@ class Std:
     ) -> None:
         assert caller.std is not None
         self.module, self.trained, self.count = caller.std, trained, count
-        self.learned = [*caller.std.own, *caller.std.shared]
+        self.learned, self._shared = [*caller.std.own, *caller.std.shared], caller.std.shared
+        self.least = caller.std.floor.double().numpy() + ABOVE_FLOOR
         self.value = _stds(caller)
         self._known = None if library is None else _stds(library)
 
@@ -200,38 +209,37 @@ class Std:
         if self._known is None:
             return 0.0
         value, known = self.value[:, self.learned], self._known[:, self.learned]
-        return self.count * float((value.log() + 0.5 * (known / value).square()).sum())
+        return self.count * float((np.log(value) + 0.5 * (known / value) ** 2).sum())
 
-    def squares(self, places: Sequence[int]) -> Tensor | float:
+    def squares(self, places: Sequence[int]) -> Array | float:
         """The sum of squares that the prior stands for, [K, C']."""
-        return 0.0 if self._known is None else self.count * self._known[:, list(places)].square()
+        return 0.0 if self._known is None else self.count * self._known[:, list(places)] ** 2
 
-    def updated(self, value: Tensor, square: Tensor, count: Tensor, places: Sequence[int]) -> Tensor:
+    def updated(self, value: Array, square: Array, count: Array, places: Sequence[int]) -> Array:
         """A table of σ [K, C] with those at these places from sums of squares [K, C'] and counts [K]."""
-        own, shared = self.module.own, self.module.shared
-        columns = [column for column, place in enumerate(places) if place in own or place in shared]
+        columns = [column for column, place in enumerate(places) if place in self.learned]
         at = [places[column] for column in columns]
-        square, value, known = square[:, columns], value.clone(), value[:, at].square()
-        together = torch.tensor([place in shared for place in at], dtype=torch.bool)
-        mean = torch.where(together, square.sum(0) / count.sum(), square / count.unsqueeze(1))
-        mean = torch.where(count.unsqueeze(1) > 0, mean, known).clamp(min=0)
-        value[:, at] = mean.sqrt().maximum(self.module.floor[at].double() + ABOVE_FLOOR)
+        square, value, known = square[:, columns], value.copy(), value[:, at] ** 2
+        number = np.where([place in self._shared for place in at], count.sum(), count[:, None])  # [K, C']
+        together = np.where([place in self._shared for place in at], square.sum(0), square)
+        mean = np.divide(together, number, out=known, where=count[:, None] > 0).clip(min=0)
+        value[:, at] = np.maximum(np.sqrt(mean), self.least[at])
         return value
 
     def store(self) -> None:
         """Give the module these values."""
         module = self.module
         with torch.no_grad():
-            raw = raw_of(self.value, module.floor)
+            raw = raw_of(torch.from_numpy(self.value), module.floor)
             if module.shared:
                 module.raw.copy_(raw[0, module.shared])
             if module.own:
                 module.raw_own.copy_(raw[:, module.own])
 
 
-def _stds(caller: Caller) -> Tensor:
+def _stds(caller: Caller) -> Array:
     assert caller.std is not None
-    return caller.std.table().detach().double().cpu().expand(caller.copies, -1).clone()
+    return caller.std.table().detach().double().cpu().expand(caller.copies, -1).numpy().copy()
 
 
 class Expectation:
@@ -279,7 +287,7 @@ class Expectation:
             for name, caller in self._callers.items()
             if caller.std is not None
         }
-        self._before: dict[str, Tensor] | None = None
+        self._before: dict[str, Array] | None = None
         self.parts: list[tuple[Tensor, Batch, dict[tuple[str, ...], Features]]] = []
         self.value, self.gain, self.stretch, self._last = -math.inf, math.inf, 1.0, math.inf
 
@@ -325,26 +333,25 @@ class Expectation:
                 self._stds[name].store()
         return value
 
-    def _state(self) -> dict[str, Tensor]:
+    def _state(self) -> dict[str, Array]:
         weights = {name: network.weight for name, network in self._networks.items()}
         return weights | {f"{name}.std": std.value for name, std in self._stds.items()}
 
-    def _restore(self, state: Mapping[str, Tensor]) -> None:
+    def _restore(self, state: Mapping[str, Array]) -> None:
         for name, network in self._networks.items():
             network.weight = state[name]
         for name, std in self._stds.items():
             std.value = state[f"{name}.std"]
 
-    def _extend(self, before: Mapping[str, Tensor]) -> None:
+    def _extend(self, before: Mapping[str, Array]) -> None:
         """Stretch the step from these weights, in log σ."""
         for name, network in self._networks.items():
             network.weight = before[name] + self.stretch * (network.weight - before[name])
         for name, std in self._stds.items():
             old = before[f"{name}.std"]
-            longer = (old * (std.value / old) ** self.stretch).maximum(
-                std.module.floor.double() + ABOVE_FLOOR
-            )
-            std.value = torch.where(std.value == old, old, longer)
+            moved = std.value != old  # a σ that depends on the state is 0 here
+            ratio = np.divide(std.value, old, out=np.ones_like(old), where=moved)
+            std.value = np.where(moved, np.maximum(old * ratio**self.stretch, std.least), old)
 
     def _penalty(self, sums: Mapping[str, Sums]) -> float:
         """The log-density of the prior that the ridges stand for, up to a constant, of what is trained.
@@ -364,21 +371,21 @@ class Expectation:
                 if group.std:
                     std, places = self._stds[name], list(group.std)
                     squares = self._penalties(away[..., group.columns], self._ridge.policy)
-                    each[:, group.columns] = squares / std.value[:, places].square()
+                    each[:, group.columns] = squares / std.value[:, places] ** 2
                     learned = [place for place in places if place in std.learned]
-                    log_stds += float(std.value[:, learned].log().sum())
+                    log_stds += float(np.log(std.value[:, learned]).sum())
             policy = 0.5 * float(each[:, choices:].sum()) + self._prior_count(away) * log_stds
             policy += self._stds[name].penalty if name in self._stds else 0.0
             total -= 0.5 * float(each[:, :choices].sum()) + float(self.model.power) * policy
         return total
 
-    def _prior_count(self, weight: Tensor) -> int:
+    def _prior_count(self, weight: Array) -> int:
         """How many numbers a mean's prior N(W0, σ²/ρ) is of: the weights, and the bias of a library."""
         return weight.shape[1] - (self._bias == BIAS) if self._ridge.policy else 0
 
-    def _penalties(self, away: Tensor, ridge: float) -> Tensor:
+    def _penalties(self, away: Array, ridge: float) -> Array:
         """Σ_f ρ_f W_f² of each copy and output, [K, n]."""
-        return (_ridges(away.shape[1], ridge, self._bias).unsqueeze(-1) * away.square()).sum(1)
+        return (_ridges(away.shape[1], ridge, self._bias)[:, None] * away**2).sum(1)
 
     def _expect(self, batch: Batch) -> tuple[float, float, dict[str, Sums]]:
         """The E-step: the score, also penalised, and the sums for the M-step of each trained network."""
@@ -406,7 +413,7 @@ class Expectation:
                 name: network.weight for name, network in self._networks.items() if network.reads == reads
             }
             said |= zip(weights, xs[reads].outputs([*weights.values()]), strict=True)
-        stds = {name: std.value.clone().requires_grad_() for name, std in self._stds.items()}
+        stds = {name: torch.from_numpy(std.value).requires_grad_() for name, std in self._stds.items()}
         for name in stds:
             said[name].requires_grad_()
         callers = {
@@ -486,7 +493,9 @@ class Expectation:
                 for name, gradient in zip(its, gradients, strict=True):
                     sums[name].gradient = sums[name].gradient + gradient
                     if (of_sigma := of_std.get(name)) is not None:
-                        sums[name].std = sums[name].std + of_sigma / power  # densities count that many times
+                        sums[name].std = (
+                            sums[name].std + of_sigma.numpy() / power
+                        )  # densities count that many times
                 for (name, group), part in zip(pairs, moments, strict=True):
                     sums[name].add_information(group, part)
         return float(value.detach())
@@ -497,7 +506,7 @@ class Expectation:
             if isinstance(own.gradient, float):
                 continue  # nothing depends on it in this stage
             network = self._networks[name]
-            change = torch.zeros_like(network.weight)
+            change = np.zeros_like(network.weight)
             std = self._stds.get(name)
             value = None if std is None else std.value
             for group, information, count in own.groups.values():
@@ -506,29 +515,24 @@ class Expectation:
                 if group.std:
                     assert std is not None
                     assert value is not None
-                    assert isinstance(own.std, Tensor)
+                    assert isinstance(own.std, Array)
                     sigma = std.value[:, list(group.std)]
-                    variance = sigma.square()
+                    variance = sigma**2
                     ridge = _ridges(away.shape[1], self._ridge.policy, self._bias)
-                    right = variance.unsqueeze(1) * gradient - ridge.unsqueeze(-1) * away
-                    solved = torch.linalg.solve(information + ridge.diag(), right)
+                    right = variance[:, None] * gradient - ridge[:, None] * away
+                    solved = np.linalg.solve(information + np.diag(ridge), right)
                     # Σ w E[(a - W^T x)²] from the gradient in σ (Fisher's identity), then that of W'
-                    square = variance * (count.unsqueeze(1) + sigma * own.std[:, list(group.std)])
-                    moved = (solved * (information @ solved)).sum(1) - 2 * variance * (solved * gradient).sum(
-                        1
-                    )
-                    square = square + moved + self._penalties(away + solved, self._ridge.policy)
-                    square, count = (
-                        square + std.squares(group.std),
-                        count + self._prior_count(away) + std.count,
-                    )
+                    square = variance * (count[:, None] + sigma * own.std[:, list(group.std)])
+                    square += (solved * (information @ solved)).sum(1)
+                    square -= 2 * variance * (solved * gradient).sum(1)
+                    square += self._penalties(away + solved, self._ridge.policy) + std.squares(group.std)
+                    count = count + self._prior_count(away) + std.count
                     value = std.updated(value, square, count, group.std)
                 else:
                     emitted = name in self._callers and columns.start >= self._callers[name].sizes[0]
                     strength = self._ridge.policy if emitted else network.ridge
-                    solved = _damped(
-                        information, gradient, away, _ridges(away.shape[1], strength, self._bias)
-                    )
+                    ridge = _ridges(away.shape[1], strength, self._bias)
+                    solved = _damped(information, gradient, away, ridge)
                 change[..., columns] = solved
             network.weight = network.weight + change
             if std is not None and std.trained and value is not None:
@@ -536,17 +540,17 @@ class Expectation:
 
 
 @cache
-def _ridges(features: int, ridge: float, bias: float) -> Tensor:
+def _ridges(features: int, ridge: float, bias: float) -> Array:
     """The ridge of each feature, [F]."""
-    return torch.tensor([max(ridge, BIAS)] * (features - 1) + [bias], dtype=torch.float64)
+    return np.array([max(ridge, BIAS)] * (features - 1) + [bias])
 
 
-def _damped(information: Tensor, gradient: Tensor, away: Tensor, ridges: Tensor) -> Tensor:
+def _damped(information: Array, gradient: Array, away: Array, ridges: Array) -> Array:
     """A Fisher scoring step [K, F, n], at most :data:`LARGEST` in any weight of a copy."""
-    right = gradient - ridges.unsqueeze(-1) * away
-    step = torch.linalg.solve(information + ridges.diag(), right.mT.unsqueeze(-1)).squeeze(-1).mT
-    most = step.abs().amax((1, 2), keepdim=True)
-    return step * (LARGEST / most.clamp(min=LARGEST))
+    right = (gradient - ridges[:, None] * away).swapaxes(1, 2)[..., None]
+    step = np.linalg.solve(information + np.diag(ridges), right)[..., 0].swapaxes(1, 2)
+    most = np.abs(step).max((1, 2), keepdims=True)
+    return cast(Array, step * (LARGEST / np.maximum(most, LARGEST)))
 
 
 def _emitted(
