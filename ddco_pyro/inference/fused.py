@@ -8,6 +8,7 @@ them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from functools import reduce
 from typing import Any, NamedTuple
@@ -99,10 +100,12 @@ def posteriors(
     structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.numpy().argsort(kind="stable")
     gains = structure.columns + (sum(tables.sizes) if marginals else 0)
     blocks, steps = -(-len(order) // lanes), tables.steps
-    written = torch.empty(gains, steps, blocks * lanes, dtype=torch.float64)
+    each = numbers_of(tables)
+    single = all(table.dtype == np.float32 for table in each)
+    kind = torch.float32 if single and gradient else torch.float64
+    written = torch.empty(gains, steps, blocks * lanes, dtype=kind)
     values, sure = torch.empty(blocks * lanes, dtype=torch.float64), np.empty(blocks * lanes, bool)
     consecutive = bool((order[1:] > order[:-1]).all())
-    each = numbers_of(tables)
 
     def some(first: int, last: int) -> None:
         its = slice(first * lanes, last * lanes)
@@ -111,10 +114,11 @@ def posteriors(
         own[: len(order[its])] = lengths.numpy()[chosen]
         rows = joined([table[..., chosen] for table in each], width)
         kernel.eliminate(
-            own, rows.ravel(), written.numpy().ravel()[its.start :], blocks * lanes, values.numpy()[its],
-            sure[its], kernel.room_for(steps, len(rows), structure.entries), tables.power, tables.logits,
-            gradient, len(rows), gains, structure.columns, *structure.tables, structure.groups,
-            structure.inert,
+            own, rows.ravel().view(np.float64), single,
+            written.numpy().ravel()[its.start :].view(np.float64), kind == torch.float32, blocks * lanes,
+            values.numpy()[its], sure[its], kernel.room_for(steps, len(rows), structure.entries),
+            tables.power, tables.logits, gradient, len(rows), gains, structure.columns, *structure.tables,
+            structure.groups, structure.inert,
         )  # fmt: skip
 
     kernel.on_threads(some, blocks, int(lengths.sum()))
@@ -134,13 +138,14 @@ def numbers_of(tables: Tables) -> list[Array]:
 
 
 def joined(each: Sequence[Array], width: int) -> Array:
-    """Numbers of tables one after the other, float64 [columns, T, width]; in memory that the next call in
-    this thread has.
+    """Numbers of tables one after the other, [columns, T, width]; in memory that the next call in this thread
+    has.
 
-    :param width: at least N; there are zeros behind.
+    :param width: a multiple of :data:`~ddco_pyro.inference.kernel.LANES`, at least N; there are zeros behind.
     """
-    columns, (_, steps, number) = sum(map(len, each)), each[0].shape
-    rows = kernel.memory("rows", columns * steps * width).reshape(columns, steps, width)
+    (_, steps, number), kind = each[0].shape, np.result_type(*each)
+    shape = sum(map(len, each)), steps, width
+    rows = kernel.memory("rows", math.prod(shape) * kind.itemsize // 8).view(kind).reshape(shape)
     rows[..., number:] = 0
     np.concatenate(each, out=rows[..., :number])
     return rows

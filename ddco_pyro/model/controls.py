@@ -174,7 +174,9 @@ class ControlScaling(nn.Module):
         sizes, at, ends = [KINDS[part.kind].size(part) for part in self.parts], 0, self.ends()
         each = numbers.split(sizes, dim=-1) if len(sizes) > 1 else (numbers,)  # a split's gradient is a copy
         for dims, part, own, count in zip(self.groups, self.parts, each, self.counts, strict=True):
-            units, low, high = (of[list(dims)] for of in (self.scale.log(), *ends))
+            every = dims == (*range(len(self.varying)),)
+            places = slice(None) if every else list(dims)  # a list is copied to a tensor
+            units, low, high = (of[places] for of in (self.scale.log(), *ends))
             given = Given(part, own, std[..., at : at + count], units, low, high)
             groups.append((dims, KINDS[part.kind].of(given)))
             at += count
@@ -226,7 +228,7 @@ class ControlStd(nn.Module):
         """σ without the dimensions whose σ depends on the state: [C]; [K, C] with a σ of each option."""
         std = self.fixed
         if self.shared:
-            std = std.index_put((torch.tensor(self.shared),), self.floor[self.shared] + softplus(self.raw))
+            std = _with_columns(std, self.shared, self.floor[self.shared] + softplus(self.raw))
         if self.own:
             std = _with_columns(std, self.own, self.floor[self.own] + softplus(self.raw_own))
         return std

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from ddco_pyro.data.controls import ControlPart
 from ddco_pyro.model.tables import by_step, by_trajectory
@@ -28,6 +29,11 @@ Part = Mapping[str, Any]
 def over_dimensions(each: Tensor) -> Tensor:
     """The sum over the control's dimensions, [..., K, A] to [..., K], in the same order in memory."""
     return by_trajectory(by_step(each, each.dim() - 2).sum(1), each.dim() - 2)
+
+
+def log_logistic(y: Tensor) -> Tensor:
+    """log logistic(y), [..., K, A], in the same order in memory; torch's own changes it."""
+    return by_trajectory(logsigmoid(by_step(y, y.dim() - 2)), y.dim() - 2)
 
 
 def phi(z: float) -> float:

@@ -9,11 +9,10 @@ from typing import ClassVar
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid
 from torch.special import ndtr
 
 from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.model.emissions.base import Emission, Information, Part, phi
+from ddco_pyro.model.emissions.base import Emission, Information, Part, log_logistic, phi
 from ddco_pyro.model.tables import NEVER
 
 
@@ -54,7 +53,7 @@ class Binary(Emission):
     def by_dimension(self, actions: Tensor) -> Tensor:
         """The log-probability of each switch's position, [..., K, A]; -inf for values other than 0 and 1."""
         actions = actions.unsqueeze(-2).to(self.logits.dtype)
-        position, known = logsigmoid((2 * actions - 1) * self.logits), (actions == 0) | (actions == 1)
+        position, known = log_logistic((2 * actions - 1) * self.logits), (actions == 0) | (actions == 1)
         return position if bool(known.all()) else torch.where(known, position, NEVER)
 
     @property

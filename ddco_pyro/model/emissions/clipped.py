@@ -49,7 +49,7 @@ class Clipped(Gaussian):
         place = (low ^ high).nonzero().squeeze(1)  # log Φ is computed on bounds alone, for each caller
         places = (place + len(low) * torch.arange(len(each)).unsqueeze(1)).flatten()
         beyond = by_step(errors, before).flatten().index_select(0, places)
-        mass = LogNormal.apply(torch.where(low[place].repeat(len(each)), beyond, -beyond))
+        mass = LogNormal.apply(beyond * (low[place] * 2.0 - 1).repeat(len(each)))
         return by_trajectory(each.flatten().index_copy(0, places, mass).view(each.shape), before)
 
     @property

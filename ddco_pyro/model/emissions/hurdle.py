@@ -9,11 +9,10 @@ from typing import ClassVar, Self
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid
 from torch.special import ndtr
 
 from ddco_pyro.data.controls import ControlPart
-from ddco_pyro.model.emissions.base import Emission, Given, Information, Part, phi
+from ddco_pyro.model.emissions.base import Emission, Given, Information, Part, log_logistic, phi
 from ddco_pyro.model.emissions.binary import of_switch
 from ddco_pyro.model.emissions.clipped import Clipped
 from ddco_pyro.model.emissions.gaussian import Gaussian, continuous_control
@@ -86,7 +85,7 @@ class Hurdle(Emission):
 
     def _part(self, at: Tensor) -> Tensor:
         """The log-probability of being at the value, or of not being there, [..., K, 1]."""
-        return logsigmoid(torch.where(at, self.logit, -self.logit))
+        return log_logistic(torch.where(at, self.logit, -self.logit))
 
     @property
     def mode(self) -> Tensor:
