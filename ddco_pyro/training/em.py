@@ -296,12 +296,8 @@ class Expectation:
         """Whether each of the last two steps gained less than :data:`TOLERANCE` (or :data:`ROUGHLY`)."""
         return self.gain < (ROUGHLY if self._roughly else TOLERANCE)
 
-    def objective(self, batch: Batch) -> float:
-        """The penalised log-likelihood of all demonstrations, nats."""
-        return self._expect(batch)[1]
-
     def log_prior(self, batch: Batch) -> float:
-        """The log-density of the prior of what is trained, up to a constant, nats."""
+        """The log-density of the prior of what is trained, up to a constant, nats: the same for any batch."""
         return self._penalty(self._expect(batch)[2])
 
     def step(self, batch: Batch) -> float:

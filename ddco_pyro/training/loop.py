@@ -264,17 +264,17 @@ class StageTraining:
         """
         train, restart = self.data.train, self.restart
         model = self.data.hierarchy(restart.progress.restart, restart.states["best"])
+        library, score = self.data.library, 0.0
+        with torch.no_grad():
+            for rows, piece in train.pieces(model.steps_at_once):
+                tables = self.objective.tables(model, piece, rows)
+                score += float(self.objective.values(tables, piece.lengths).sum())
+            if library is not None and not isinstance(self.whole, Expectation):
+                score += float(library.log_density(model))
         if isinstance(self.whole, Expectation):
-            ridge, prior = self.spec.optimizer.ridge, self.data.library
-            whole = Expectation(model, EVERYTHING, self.objective.score, ridge, prior=prior)
-            score = whole.objective(train)
-        else:
-            with torch.no_grad():
-                score = 0.0
-                for rows, piece in train.pieces(model.steps_at_once):
-                    tables = self.objective.tables(model, piece, rows)
-                    score += float(self.objective.values(tables, piece.lengths).sum())
-                score += 0.0 if self.data.library is None else float(self.data.library.log_density(model))
+            settings = self.objective.score, self.spec.optimizer.ridge
+            whole = Expectation(model, EVERYTHING, *settings, prior=library)
+            score += whole.log_prior(train.select(torch.tensor([0])))
         return score / train.steps
 
     def end(self, cap: int | None) -> None:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -46,7 +47,8 @@ class Clipped(Gaussian):
         errors, before = self._errors(actions.clamp(self.low, self.high)), actions.dim() - 1
         each = by_step(self._scored(errors), before)
         low, high = (by_step(on, before).flatten() for on in (actions <= self.low, actions >= self.high))
-        place = (low ^ high).nonzero().squeeze(1)  # log Φ is computed on bounds alone, for each caller
+        on_bound = np.flatnonzero((low ^ high).numpy())  # torch's own takes ten times as long
+        place = torch.from_numpy(on_bound)  # log Φ is computed there alone, for each caller
         places = (place + len(low) * torch.arange(len(each)).unsqueeze(1)).flatten()
         beyond = by_step(errors, before).flatten().index_select(0, places)
         mass = LogNormal.apply(beyond * (low[place] * 2.0 - 1).repeat(len(each)))

@@ -64,7 +64,8 @@ class Gaussian(Emission):
 
     def _offset(self) -> Tensor:
         """log σ √2π in the control's own units, [A], [K, A] or [..., K, A]."""
-        return (self.std.log() + self.log_scale + 0.5 * LOG_2PI).to(self.mean.dtype)
+        units = (self.log_scale + 0.5 * LOG_2PI).to(self.std.dtype)  # float64 would make all of it float64
+        return (self.std.log() + units).to(self.mean.dtype)
 
     def _errors(self, actions: Tensor) -> Tensor:
         """(a_d - μ_d) / σ_d, [..., K, A]."""
