@@ -72,6 +72,8 @@ for command, example in EXAMPLES.items():
 
 def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
+    young, middle, _ = gc.get_threshold()
+    gc.set_threshold(young, middle, 1000)  # searches of all that is imported would take most of a second
     with _interruptible():
         status = _run()
     if not ("ompl" in sys.modules or "--allow-code" in sys.argv):  # bindings may report what Python leaves
