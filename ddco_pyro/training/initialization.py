@@ -17,7 +17,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -84,13 +85,8 @@ class Clusters:
 
             self._namer = LogisticRegression(max_iter=ITERATIONS).fit(rows[known > 0], known[known > 0] - 1)
         else:
-            from sklearn.cluster import KMeans
-
-            start = ("k-means++" if best else "random") if known is None else _Start(known)
-            number = distinct(rows, options)
-            self._namer = KMeans(
-                number, init=start, n_init=10 if best else 1, max_iter=ITERATIONS, random_state=seed
-            ).fit(rows)
+            start = None if known is None else _Start(known)
+            self._namer = _k_means(rows.tobytes(), rows.shape[1], distinct(rows, options), start, best, seed)
 
     def choices(self, batch: Batch) -> Tensor:
         """The cluster of each step, [N, T], 1 to k; 0 where there is padding."""
@@ -109,6 +105,16 @@ class Clusters:
             if self._window:
                 rows = window_means(rows, torch.tensor([length]), self._window, self._window)
             yield rows[0].numpy()
+
+
+@lru_cache(maxsize=4)
+def _k_means(rows: bytes, numbers: int, clusters: int, start: _Start | None, best: bool, seed: int) -> KMeans:
+    """The clusters of rows of so many numbers. A model and the mixture beside it begin from the same ones."""
+    from sklearn.cluster import KMeans
+
+    init = start or ("k-means++" if best else "random")
+    found = KMeans(clusters, init=init, n_init=10 if best else 1, max_iter=ITERATIONS, random_state=seed)
+    return found.fit(np.frombuffer(rows).reshape(-1, numbers))
 
 
 def most_rows(numbers: int) -> int:
@@ -234,23 +240,45 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
     )
     fold = (torch.arange(len(batch)) % min(FOLDS, len(batch))).unsqueeze(1)
     ridges = ridge * torch.tensor(RAISED, dtype=torch.float64)
-    total = torch.zeros_like(ridges)
-    for left_out in fold.unique():
-        for cluster in range(1, count + 1):
-            inside = alive & (clusters == cluster)
-            parts = inside & (fold != left_out), inside & (fold == left_out)
-            rows = [(x[where], batch.actions[where][:, dims].double()) for where in parts]
-            total += _score(*rows[0], *rows[1], ridges)
+    total, controls = torch.zeros_like(ridges), batch.actions[..., dims].double()
+    for cluster in range(1, count + 1):
+        parts = (alive & (clusters == cluster) & (fold == part) for part in fold.unique())
+        each = [Moments.of(x[where], controls[where]) for where in parts]
+        every = [sum(own) for own in zip(*each, strict=True)]
+        for left_out in each:
+            known = Moments(*(whole - out for whole, out in zip(every, left_out, strict=True)))
+            total += left_out_likelihood(known, left_out, ridges)
     values = total / batch.steps
     return float(ridges[int((values >= values.max() - GAIN).nonzero()[0])])
 
 
-def _score(x: Tensor, actions: Tensor, others: Tensor, their: Tensor, ridges: Tensor) -> Tensor:
+class Moments(NamedTuple):
+    """Sums over steps, by which regressions are fitted and scored: of x x^T [F, F], x a^T [F, A], a² [A], and
+    1.
+    """
+
+    square: Tensor
+    product: Tensor
+    controls: Tensor
+    steps: Tensor
+
+    @classmethod
+    def of(cls, x: Tensor, actions: Tensor) -> Moments:
+        """Of steps with features [M, F] and controls [M, A]."""
+        return cls(x.T @ x, x.T @ actions, actions.square().sum(0), torch.tensor(float(len(x))))
+
+    def errors(self, weight: Tensor) -> Tensor:
+        """Σ_t (a - W^T x)² of each of R regressions [R, F, A], [R, A]."""
+        found = (weight * (self.square @ weight - 2 * self.product)).sum(1)
+        return (self.controls + found).clamp(min=0)
+
+
+def left_out_likelihood(known: Moments, left_out: Moments, ridges: Tensor) -> Tensor:
     """The log-likelihood of left-out controls by regressions with R ridges, up to a constant, [R] nats."""
-    prior = ridges.unsqueeze(-1).repeat(1, x.shape[-1])
+    features = len(known.square)
+    prior = ridges.unsqueeze(-1).repeat(1, features)
     prior[:, -1] = BIAS
-    weight = torch.linalg.solve(x.T @ x + torch.diag_embed(prior), x.T @ actions)  # [R, F, A]
-    square = (actions - x @ weight).square().sum(1) + (prior.unsqueeze(-1) * weight.square()).sum(1)
-    std = (square / max(len(x) + x.shape[-1] - 1, 1)).sqrt().clamp(min=LEAST)
-    error = (their - others @ weight) / std.unsqueeze(1)
-    return -0.5 * error.square().sum((1, 2)) - len(their) * std.log().sum(1)
+    weight = torch.linalg.solve(known.square + torch.diag_embed(prior), known.product)  # [R, F, A]
+    square = known.errors(weight) + (prior.unsqueeze(-1) * weight.square()).sum(1)
+    std = (square / (known.steps + features - 1).clamp(min=1)).sqrt().clamp(min=LEAST)
+    return -0.5 * (left_out.errors(weight) / std.square()).sum(1) - left_out.steps * std.log().sum(1)

@@ -21,7 +21,7 @@ from linear import (
 from planted import LINEAR, make_spec, make_trainer, small_spec
 from random_demonstrations import demonstrations, numbered
 from scipy import optimize, stats
-from sklearn.linear_model import LogisticRegression
+from sklearn.linear_model import LogisticRegression, Ridge
 from sklearn.metrics import normalized_mutual_info_score
 
 import ddco_pyro
@@ -37,7 +37,7 @@ from ddco_pyro.model.emissions import KINDS
 from ddco_pyro.model.outputs import bounded
 from ddco_pyro.spec import RidgeSpec, parse_spec, with_overrides
 from ddco_pyro.training.em import Expectation
-from ddco_pyro.training.initialization import cross_validated
+from ddco_pyro.training.initialization import Moments, cross_validated, left_out_likelihood
 from ddco_pyro.training.networks import Dimensions
 from ddco_pyro.training.optimizers import is_linear
 from ddco_pyro.training.restarts import Trainer
@@ -396,6 +396,20 @@ def test_ridges_are_raised_where_demonstrations_are_few_for_their_observations(t
     assert held.training.raised_ridge >= 30
     assert f"ridge {held.training.raised_ridge:g}" in verdicts.effort(held.training)
     assert held.log_likelihood_per_step.valid > fallen.log_likelihood_per_step.valid + 50
+
+
+def test_left_out_controls_are_as_likely_as_by_another_library_s_regressions():
+    random = np.random.default_rng(0)
+    x, weight = random.normal(size=(90, 4)), random.normal(size=(4, 2))
+    a = x @ weight + 0.3 + 0.1 * random.normal(size=(90, 2))
+    rows, ridges = torch.tensor(np.c_[x, np.ones(90)]), torch.tensor([0.5, 20.0], dtype=torch.float64)
+    known, left_out = (Moments.of(rows[its], torch.tensor(a)[its]) for its in (slice(60), slice(60, None)))
+    for found, ridge in zip(left_out_likelihood(known, left_out, ridges), ridges.tolist(), strict=True):
+        fitted = Ridge(ridge).fit(x[:60], a[:60])
+        squares = ((a[:60] - fitted.predict(x[:60])) ** 2).sum(0) + ridge * (fitted.coef_**2).sum(1)
+        normal = stats.norm(fitted.predict(x[60:]), np.sqrt(squares / (60 + 4)))
+        truth = normal.logpdf(a[60:]).sum() + 30 * 2 * 0.5 * np.log(2 * np.pi)
+        assert float(found) == pytest.approx(truth, rel=1e-6)
 
 
 @pytest.mark.parametrize(
