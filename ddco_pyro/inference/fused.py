@@ -8,8 +8,7 @@ them.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -100,25 +99,21 @@ def posteriors(
     structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.numpy().argsort(kind="stable")
     gains = structure.columns + (sum(tables.sizes) if marginals else 0)
     blocks, steps = -(-len(order) // lanes), tables.steps
-    each = numbers_of(tables)
-    single = all(table.dtype == np.float32 for table in each)
-    kind = torch.float32 if single and gradient else torch.float64
-    written = torch.empty(gains, steps, blocks * lanes, dtype=kind)
+    written = torch.empty(gains, steps, blocks * lanes, dtype=torch.float64)
     values, sure = torch.empty(blocks * lanes, dtype=torch.float64), np.empty(blocks * lanes, bool)
     consecutive = bool((order[1:] > order[:-1]).all())
+    columns = sum(map(len, each := numbers_of(tables)))
 
     def some(first: int, last: int) -> None:
         its = slice(first * lanes, last * lanes)
-        chosen, width = its if consecutive else order[its], its.stop - its.start
-        own = np.zeros(width, np.int64)
-        own[: len(order[its])] = lengths.numpy()[chosen]
-        rows = joined([table[..., chosen] for table in each], width)
+        chosen, width, number = its if consecutive else order[its], its.stop - its.start, len(order[its])
+        own, rows = np.zeros(width, np.int64), kernel.memory("rows", columns, steps, width)
+        own[:number], rows[..., number:] = lengths.numpy()[chosen], 0
+        np.concatenate([table[..., chosen] for table in each], out=rows[..., :number])
         kernel.eliminate(
-            own, rows.ravel().view(np.float64), single,
-            written.numpy().ravel()[its.start :].view(np.float64), kind == torch.float32, blocks * lanes,
-            values.numpy()[its], sure[its], kernel.room_for(steps, len(rows), structure.entries),
-            tables.power, tables.logits, gradient, len(rows), gains, structure.columns, *structure.tables,
-            structure.groups, structure.inert,
+            own, rows.ravel(), written.numpy().ravel()[its.start :], blocks * lanes, values.numpy()[its],
+            sure[its], kernel.room_for(steps, columns, structure.entries), tables.power, tables.logits,
+            gradient, columns, gains, structure.columns, *structure.tables, structure.groups, structure.inert,
         )  # fmt: skip
 
     kernel.on_threads(some, blocks, int(lengths.sum()))
@@ -135,20 +130,6 @@ def numbers_of(tables: Tables) -> list[Array]:
     each = [*_in_order(tables), *([] if evidence is None else [evidence])]
     numbers = (table.detach().numpy() for table in each)
     return [own.transpose(*range(2, own.ndim), 1, 0).reshape(-1, *own.shape[1::-1]) for own in numbers]
-
-
-def joined(each: Sequence[Array], width: int) -> Array:
-    """Numbers of tables one after the other, [columns, T, width]; in memory that the next call in this thread
-    has.
-
-    :param width: a multiple of :data:`~ddco_pyro.inference.kernel.LANES`, at least N; there are zeros behind.
-    """
-    (_, steps, number), kind = each[0].shape, np.result_type(*each)
-    shape = sum(map(len, each)), steps, width
-    rows = kernel.memory("rows", math.prod(shape) * kind.itemsize // 8).view(kind).reshape(shape)
-    rows[..., number:] = 0
-    np.concatenate(each, out=rows[..., :number])
-    return rows
 
 
 def _in_order(tables: Tables) -> list[Tensor]:

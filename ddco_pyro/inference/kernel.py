@@ -51,19 +51,19 @@ STEPS_A_THREAD = 4096
 
 _kept = threading.local()
 
-# The C library keeps free memory up to twice the largest block that was given back, and a step of training
-# makes and frees its tensors anew: to have them cleared by the system each time takes a fifth of the step.
+# The C library keeps as much free memory as twice the largest block that was given back to it. Without it the
+# system would clear the tensors of each step of training anew, which takes a fifth of the step.
 torch.empty(2**25 - 2**16, dtype=torch.uint8)
 
 
-def memory(name: str, numbers: int) -> Array:
-    """Room for so many numbers that this thread keeps: new memory in each pass takes as long as the pass.
+def memory(name: str, *shape: int) -> Array:
+    """Room for numbers that this thread keeps: new memory in each pass takes as long as the pass.
 
     torch's begins where a line of the cache does, numpy's does not: each vector would lie in two lines.
     """
-    if len(getattr(_kept, name, ())) < numbers:
+    if len(getattr(_kept, name, ())) < (numbers := math.prod(shape)):
         setattr(_kept, name, torch.empty(numbers, dtype=torch.float64).numpy())
-    return cast(Array, getattr(_kept, name)[:numbers])
+    return cast(Array, getattr(_kept, name)[:numbers].reshape(shape))
 
 
 class Structure(NamedTuple):
@@ -206,34 +206,25 @@ def lanewise(compute: Callable[..., Any]) -> Callable[[Array, int, int, int], No
     return cast(Callable[[Array, int, int, int], None], over_lanes)
 
 
-def mover(source: ir.Type, into: ir.Type) -> Callable[[Array, int, Array, int], None]:
-    """A compiled ``f(to, at, numbers, start)`` that copies :data:`LANES` numbers between flat arrays.
+@intrinsic  # type: ignore[untyped-decorator]
+def _moved(typing: Any, into: Any, at: Any, source: Any, start: Any) -> Any:
+    """Compiled: copy :data:`LANES` numbers of a flat array to a place of another."""
 
-    Places count numbers of these types; numba may see other types.
-    """
+    def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+        vector = ir.VectorType(ir.DoubleType(), LANES).as_pointer()
 
-    @intrinsic  # type: ignore[untyped-decorator]
-    def moved(typing: Any, to: Any, at: Any, array: Any, start: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
-            def place(array: Any, value: Any, index: Any, number: ir.Type) -> Any:
-                data = context.make_array(array)(context, builder, value).data
-                first = builder.gep(builder.bitcast(data, number.as_pointer()), [index])
-                return builder.bitcast(first, ir.VectorType(number, LANES).as_pointer())
+        def place(array: Any, value: Any, index: Any) -> Any:
+            data = context.make_array(array)(context, builder, value).data
+            return builder.bitcast(builder.gep(data, [index]), vector)
 
-            numbers = builder.load(place(array, arguments[2], arguments[3], source), align=4)
-            if source is not into:
-                convert = builder.fptrunc if into is SINGLE else builder.fpext
-                numbers = convert(numbers, ir.VectorType(into, LANES))
-            builder.store(numbers, place(to, arguments[0], arguments[1], into), align=4)
-            return context.get_dummy_value()
+        numbers = builder.load(place(source, *arguments[2:]), align=8)
+        builder.store(numbers, place(into, *arguments[:2]), align=8)
+        return context.get_dummy_value()
 
-        return numba.void(to, numba.intp, array, numba.intp), generate
-
-    return cast(Callable[[Array, int, Array, int], None], moved)
+    return numba.void(into, numba.intp, source, numba.intp), generate
 
 
-SINGLE, DOUBLE = ir.FloatType(), ir.DoubleType()
-move, widen, narrow = mover(DOUBLE, DOUBLE), mover(SINGLE, DOUBLE), mover(DOUBLE, SINGLE)
+move = cast(Callable[[Array, int, Array, int], None], _moved)
 FUSED = ("contract",)
 multiply = lanewise(lambda make, out, a, b: make.fmul(a, b, FUSED))
 accumulate = lanewise(lambda make, out, a, b: make.fadd(out, make.fmul(a, b, FUSED), FUSED))
@@ -277,33 +268,21 @@ def _lower(room: Array, first: int, number: int) -> None:
 
 @inner
 def _read(
-    room: Array, p: int, stride: int, t: int, steps: int, first: int, lengths: Array, rows: Array,
-    single: bool, number: int, columns: int, inert: Array,
+    room: Array, p: int, stride: int, t: int, first: int, lengths: Array, rows: Array, number: int,
+    columns: int, inert: Array,
 ) -> None:  # fmt: skip
     """Fill the logarithms of some steps of a block from t on. Past its end a trajectory keeps every choice.
 
     :param p: row of the first of ``number`` logarithms at t; those of the next step are ``stride`` rows on.
     """
+    steps = len(rows) // (number * len(lengths))
     for c in range(number):
         for u in range(min(TOGETHER, steps - t)):
-            into, place = LANES * (p + u * stride + c), (c * steps + t + u) * len(lengths) + first
-            if single:
-                widen(room, into, rows, place)
-            else:
-                move(room, into, rows, place)
+            move(room, LANES * (p + u * stride + c), rows, (c * steps + t + u) * len(lengths) + first)
     for lane in range(LANES):
         for u in range(max(lengths[first + lane] - t, 0), min(TOGETHER, steps - t)):
             for c in range(number):
                 room[LANES * (p + u * stride + c) + lane] = inert[c] if c < columns else 0.0
-
-
-@inner
-def _write(posterior: Array, rounded: bool, place: int, room: Array, row: int) -> None:
-    """Put a row where it belongs."""
-    if rounded:
-        narrow(posterior, place, room, LANES * row)
-    else:
-        move(posterior, place, room, LANES * row)
 
 
 @inner
@@ -415,9 +394,9 @@ def _backward(
 
 @entry
 def eliminate(
-    lengths: Array, rows: Array, single: bool, posterior: Array, rounded: bool, width: int, value: Array,
-    exact: Array, room: Array, power: float, logits: bool, gradient: bool, number: int, gains: int,
-    columns: int, callers: Array, actors: Array, choices: Array, above: Array, groups: Array, inert: Array,
+    lengths: Array, rows: Array, posterior: Array, width: int, value: Array, exact: Array, room: Array,
+    power: float, logits: bool, gradient: bool, number: int, gains: int, columns: int, callers: Array,
+    actors: Array, choices: Array, above: Array, groups: Array, inert: Array,
 ) -> None:  # fmt: skip
     """Fill ``value``, ``exact`` and the posteriors, with :data:`LANES` trajectories in a block.
 
@@ -427,13 +406,13 @@ def eliminate(
     :param lengths: of the trajectories, [N], N a multiple of :data:`LANES`; 0 where there is none. Those of a
         block should be about as long.
     :param rows: ``number`` columns of log-probabilities, a flat [number, T, N]; of selections and
-        terminations logits where ``logits`` says so. Float32, two in a float64, where it is ``single``.
+        terminations logits where ``logits`` says so.
     :param posterior: these trajectories' place in a flat [gains, T, ``width``], or that of the derivative of
-        log p(ξ) with respect to ``rows``, where ``gradient`` says so. Float32 where it is ``rounded``.
+        log p(ξ) with respect to ``rows``, where ``gradient`` says so.
     :param value: log p(ξ), [N]; ``exact`` likewise.
     :param room: of :func:`room_for`.
     """
-    size, steps = len(above) + 1, len(rows) * (2 if single else 1) // (number * len(lengths))
+    size, steps = len(above) + 1, len(rows) // (number * len(lengths))
     begin, stride, controls = FIXED + size, number + 2 * size + 1, groups[-1, 0]
     for i in range(LANES):
         room[LANES * ONE + i], room[LANES * ZERO + i], room[LANES * POWER + i] = 1.0, 0.0, power
@@ -450,7 +429,7 @@ def eliminate(
         for t in range(longest):
             p = begin + t * stride
             if t % TOGETHER == 0:
-                _read(room, p, stride, t, steps, first, lengths, rows, single, number, columns, inert)
+                _read(room, p, stride, t, first, lengths, rows, number, columns, inert)
             _load(room, p, number, columns, logits, power != 1.0, groups)
             _forward(room, p, number, columns, t, callers, actors)
             smallest(room, LEAST, LEAST, TOTAL)
@@ -482,10 +461,10 @@ def eliminate(
                 for c in range(gains):
                     for u in range(min(TOGETHER, longest - t)):
                         place = (c * steps + t + u) * width + first
-                        _write(posterior, rounded, place, room, gain + u * stride + c)
+                        move(posterior, place, room, LANES * (gain + u * stride + c))
         for t in range(longest, steps):
             for c in range(gains):
-                _write(posterior, rounded, (c * steps + t) * width + first, room, ZERO)
+                move(posterior, (c * steps + t) * width + first, room, LANES * ZERO)
         for lane in range(LANES):
             n, most = first + lane, 0.0
             for i in range(size):  # an overflow at t = 0 shows nowhere else
@@ -599,11 +578,8 @@ def _back(
             level += 1
         ended[n, m, t] = level
         for d in range(level - 1 if t > 0 else -1, -1, -1):
-            i, mass, left = (
-                entry - len(actors),
-                messages[t, entry],
-                uniforms[n, m, t, uniforms.shape[3] // 2 + d],
-            )
+            i, mass = entry - len(actors), messages[t, entry]
+            left = uniforms[n, m, t, uniforms.shape[3] // 2 + d]
             entry = callers[i, 0]
             for j in range(callers[i, 1]):
                 part = messages[t, callers[i, 0] + j]
@@ -651,9 +627,7 @@ def trace(
 
 @entry
 def products(x: Array, first: int, pairs: Array) -> None:
-    """The products of each two rows of x [F, T], from a column on, into ``pairs`` [F·(F + 1) / 2, B]: the
-    lower triangle, row by row.
-    """
+    """Products of each two rows of x [F, T] from a column on: a lower triangle [F·(F + 1) / 2, B]."""
     place, last = 0, first + pairs.shape[1]
     for i in range(len(x)):
         for j in range(i + 1):

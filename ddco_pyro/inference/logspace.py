@@ -40,29 +40,23 @@ def arrive(message: Tensor | None, now: Chain) -> Tensor:
     """
     kept: list[Tensor] = []
     if message is None:
-        message = torch.zeros(
-            len(now.alive), dtype=torch.float64, device=now.alive.device
-        )  # everything is selected
+        # everything is selected
+        message = torch.zeros(len(now.alive), dtype=torch.float64, device=now.alive.device)
     else:
         for table in now.termination:
-            keep, terminate = _along_last(table[..., 0], message), _along_last(table[..., 1], message)
+            keep, terminate = _along(table[..., 0], message), _along(table[..., 1], message)
             kept.append(message + keep)
             message = log_sum(message + terminate)
     for level in range(len(now.selection), 0, -1):
         table = now.selection[level - 1]
-        table = table.squeeze(1) if level == len(now.selection) else _along_last_two(table, message)
+        table = table.squeeze(1) if level == len(now.selection) else _along(table, message)
         selected = message.unsqueeze(-1) + table
         message = log_sum(torch.stack([selected, kept[level - 1]], dim=-1)) if kept else selected
     return message
 
 
-def _along_last(table: Tensor, message: Tensor) -> Tensor:
-    """[N, C_d] against [N, C_D, ..., C_d]."""
-    return table.reshape(table.shape[:1] + (1,) * (message.dim() - 2) + table.shape[1:])
-
-
-def _along_last_two(table: Tensor, message: Tensor) -> Tensor:
-    """[N, C_{d+1}, C_d] against [N, C_D, ..., C_{d+1}, 1]."""
+def _along(table: Tensor, message: Tensor) -> Tensor:
+    """[N, C_d] against [N, C_D, ..., C_d], or [N, C_{d+1}, C_d] against [N, C_D, ..., C_{d+1}, 1]."""
     return table.reshape(table.shape[:1] + (1,) * (message.dim() - 2) + table.shape[1:])
 
 

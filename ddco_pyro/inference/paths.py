@@ -6,7 +6,6 @@ after the other, O(D + Σ C_d) a step.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -129,8 +128,8 @@ def _recursion(
         longest, size, own = int(lengths[first:last].max()), structure.entries, slice(first, last)
         its = tables.part(torch.arange(first, last), longest).normalised()
         each = [table.T for table in numbers_of(its)]  # the numbers of a step side by side
-        shape = last - first, longest, sum(table.shape[-1] for table in each)
-        rows = np.concatenate(each, -1, kernel.memory("rows", math.prod(shape)).reshape(shape))
+        columns = sum(table.shape[-1] for table in each)
+        rows = np.concatenate(each, -1, kernel.memory("rows", last - first, longest, columns))
         rows[..., controls] *= tables.power
         room = np.empty((longest + 1, size)), np.empty((longest, size))
         kernel.trace(

@@ -431,11 +431,8 @@ class Expectation:
         leaves = [None if leaf is None else leaf.detach().requires_grad_() for leaf in tables.leaves()]
         value = self._score(Tables.of(tables.depth, leaves, power), piece, rows)
         found = torch.autograd.grad(value, [leaf for leaf in leaves if leaf is not None], allow_unused=True)
-        chosen, ended, acted = (
-            found[: len(levels)],
-            found[len(levels) : 2 * len(levels)],
-            found[2 * len(levels) :],
-        )
+        depth = len(levels)
+        chosen, ended, acted = found[:depth], found[depth : 2 * depth], found[2 * depth :]
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
         acting = {
             name: own for name, own in zip(every, acted, strict=False) if name in stds and own is not None
@@ -443,12 +440,10 @@ class Expectation:
         densities = [table for name, table in zip(every, tables.control, strict=False) if name in acting]
         wanted = [leaf[name] for leaf in (said, stds) for name in acting]
         weighed = [(own * table).sum() for own, table in zip(acting.values(), densities, strict=True)]
-        slopes = (
-            torch.autograd.grad(weighed, wanted, allow_unused=True) if acting else ()
-        )  # weights would import sympy
-        of, of_std = (
-            dict(zip(acting, part, strict=True)) for part in (slopes[: len(acting)], slopes[len(acting) :])
-        )
+        # weights in place of sums would import sympy
+        slopes = torch.autograd.grad(weighed, wanted, allow_unused=True) if acting else ()
+        halves = slopes[: len(acting)], slopes[len(acting) :]
+        of, of_std = (dict(zip(acting, part, strict=True)) for part in halves)
         learned: dict[str, list[Information]] = {}
         with torch.no_grad():
             selecting = (name for name in every if callers[name].options)
@@ -461,9 +456,7 @@ class Expectation:
                     learned[name] = [Information.of_logits(columns, asked, p[..., -columns.stop :])]
             for name, own in acting.items():
                 if name in sums:
-                    of[name][..., self._callers[name].sizes[0] :] /= (
-                        power  # M-steps of policies know no power
-                    )
+                    of[name][..., self._callers[name].sizes[0] :] /= power  # M-steps of policies know none
                     emission = callers[name].emission
                     assert emission is not None  # it has parameters
                     caller, emission = self._callers[name], emission.map(Tensor.detach)
@@ -489,9 +482,7 @@ class Expectation:
                 for name, gradient in zip(its, gradients, strict=True):
                     sums[name].gradient = sums[name].gradient + gradient
                     if (of_sigma := of_std.get(name)) is not None:
-                        sums[name].std = (
-                            sums[name].std + of_sigma.numpy() / power
-                        )  # densities count that many times
+                        sums[name].std = sums[name].std + of_sigma.numpy() / power  # counted so often
                 for (name, group), part in zip(pairs, moments, strict=True):
                     sums[name].add_information(group, part)
         return float(value.detach())

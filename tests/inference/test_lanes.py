@@ -9,7 +9,7 @@ from oracle import brute_force, random_tables
 
 from ddco_pyro.inference import log_likelihood, logspace, posterior
 from ddco_pyro.inference.kernel import LANES
-from ddco_pyro.model.tables import NEVER, Tables, complete
+from ddco_pyro.model.tables import NEVER, complete
 
 SHAPES = [((1,), (True,)), ((3,), (False,)), ((2, 2), (True, False)), ((2, 1, 2), (True, True, True))]
 
@@ -66,19 +66,3 @@ def test_the_gradient_of_logits_is_that_of_the_recursion_in_logarithms(counts, h
     for leaf, own, their in zip(leaves, ours, theirs, strict=True):
         entries = leaf > NEVER  # an impossible entry has no logarithm to differentiate by
         torch.testing.assert_close(own[entries], their[entries], rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize(("counts", "hybrid"), SHAPES)
-def test_float32_tables_have_the_float64_likelihood_and_its_rounded_gradient(counts, hybrid):
-    tables, lengths = unequal(counts, hybrid, steps=40, seed=3)
-    single = as_logits(tables).map(torch.Tensor.float)
-
-    def eliminated(given):
-        leaves = [leaf.requires_grad_() for leaf in given.leaves()]
-        value = log_likelihood(Tables.of(given.depth, leaves, logits=True), lengths)
-        return value, torch.autograd.grad(value.sum(), leaves)
-
-    (value, slopes), (truth, their) = eliminated(single), eliminated(single.map(torch.Tensor.double))
-    assert torch.equal(value, truth)
-    for slope, exact in zip(slopes, their, strict=True):
-        torch.testing.assert_close(slope, exact.float(), rtol=2e-7, atol=0)
