@@ -99,7 +99,7 @@ def posteriors(
     structure, lanes, order = Structure.of(tables.sizes), kernel.LANES, lengths.numpy().argsort(kind="stable")
     gains = structure.columns + (sum(tables.sizes) if marginals else 0)
     blocks, steps = -(-len(order) // lanes), tables.steps
-    written = torch.empty(gains, steps, blocks * lanes, dtype=torch.float64)
+    written = torch.from_numpy(kernel.new(gains, steps, blocks * lanes))
     values, sure = torch.empty(blocks * lanes, dtype=torch.float64), np.empty(blocks * lanes, bool)
     consecutive = bool((order[1:] > order[:-1]).all())
     columns = sum(map(len, each := numbers_of(tables)))

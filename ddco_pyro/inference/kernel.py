@@ -20,6 +20,7 @@ slices.
 from __future__ import annotations
 
 import math
+import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -57,13 +58,16 @@ torch.empty(2**25 - 2**16, dtype=torch.uint8)
 
 
 def memory(name: str, *shape: int) -> Array:
-    """Room for numbers that this thread keeps: new memory in each pass takes as long as the pass.
-
-    torch's begins where a line of the cache does, numpy's does not: each vector would lie in two lines.
-    """
+    """Room for numbers that this thread keeps: new memory in each pass takes as long as the pass."""
     if len(getattr(_kept, name, ())) < (numbers := math.prod(shape)):
-        setattr(_kept, name, torch.empty(numbers, dtype=torch.float64).numpy())
+        setattr(_kept, name, new(numbers))
     return cast(Array, getattr(_kept, name)[:numbers].reshape(shape))
+
+
+def new(*shape: int) -> Array:
+    """Room that begins with a line of the cache: no vector lies in two. numpy asks for large pages."""
+    room = np.empty((numbers := math.prod(shape)) + LANES)
+    return room[-room.ctypes.data // 8 % LANES :][:numbers].reshape(shape)
 
 
 class Structure(NamedTuple):
@@ -160,11 +164,18 @@ def on_threads(run: Callable[[int, int], object], number: int, steps: int) -> No
     bounds = [number * part // threads for part in range(threads + 1)]
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, bounds[:-1], bounds[1:]))
+        list(_pool(threads).map(run, bounds[:-1], bounds[1:]))
     finally:
         torch.set_num_threads(most)
 
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that keep their memory (:func:`memory`)."""
+    return ThreadPoolExecutor(threads)
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)
 
 inner = numba.njit(error_model="numpy", fastmath={"contract"}, inline="always")
 # numba's own type knows no unpacking
@@ -478,9 +489,7 @@ def eliminate(
 
 
 def room_for(steps: int, columns: int, entries: int) -> Array:
-    """Room for :func:`eliminate` over T steps: rows of each step, and M messages. The posteriors of a step
-    take the place of the next step but one.
-    """
+    """Room for :func:`eliminate`: rows of T steps and M messages. Posteriors replace the next step but one."""
     return memory("room", LANES * (FIXED + entries + (steps + 2) * (columns + 2 * entries + 1)))
 
 
