@@ -137,7 +137,7 @@ def step(
 
     def run() -> None:
         optimizer.zero_grad()
-        for _, piece in batch.pieces() if pieces else [(None, batch)]:
+        for _, piece in batch.pieces(hierarchy.steps_at_once) if pieces else [(None, batch)]:
             loss(piece).backward()
         optimizer.step()
 

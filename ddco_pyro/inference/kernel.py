@@ -489,7 +489,7 @@ def eliminate(
 
 
 def room_for(steps: int, columns: int, entries: int) -> Array:
-    """Room for :func:`eliminate`: rows of T steps and M messages. Posteriors replace the next step but one."""
+    """Room for :func:`eliminate`: rows of T steps, M messages. Posteriors replace the next step but one."""
     return memory("room", LANES * (FIXED + entries + (steps + 2) * (columns + 2 * entries + 1)))
 
 

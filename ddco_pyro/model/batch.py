@@ -16,9 +16,11 @@ from ddco_pyro.model.networks import Inputs
 from ddco_pyro.model.tables import consecutive, part
 
 STEPS_AT_ONCE = 12288
-"""Most steps of a piece of a batch; fewer where a step takes much memory
-(:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`). Memory stays bounded, and the cache holds most
-of what a piece needs. Of long trajectories fewer steps would leave lanes of the pass empty."""
+"""Most steps of a piece of a batch. The cache holds most of what these need. More or fewer go together where
+a step takes little or much memory (:attr:`~ddco_pyro.model.hierarchy.Hierarchy.steps_at_once`)."""
+
+SIDE_BY_SIDE = 8
+"""Trajectories that exact inference takes through a step together: other numbers leave some of them idle."""
 
 LARGEST_SCALED = 1e12
 """Largest feature or control in scaled units. The squares of what networks make of it, divided by that of a
@@ -58,8 +60,9 @@ class Batch:
 
     def pieces(self, steps: int = STEPS_AT_ONCE) -> Iterator[tuple[Tensor, Batch]]:
         """Parts of at most ``steps`` steps with padding, or of one demonstration, each with its rows."""
-        longest = int(self.lengths.max())
-        for rows in torch.arange(len(self)).split(max(steps // longest, 1)):
+        most = max(steps // int(self.lengths.max()), 1)
+        most -= most % SIDE_BY_SIDE if most > SIDE_BY_SIDE else 0
+        for rows in torch.arange(len(self)).split(most):
             yield rows, self.select(rows) if len(rows) < len(self) else self
 
     def parts(self, rows: Tensor, steps: int) -> Parts:

@@ -43,6 +43,9 @@ from ddco_pyro.spec.networks import PerTimestepSpec
 BYTES_AT_ONCE = 256 * 10**6
 """Most bytes that networks take for the steps that go through them together, at least one step."""
 
+NARROW = 1000
+"""Networks that take fewer bytes for a step go through twice as many steps together: the cache has room."""
+
 PART_OF_A_GPU = 0.1
 """Share of a GPU's whole memory that networks take in place of that, so that GPUs of one kind cut alike."""
 
@@ -275,7 +278,8 @@ class Hierarchy(nn.Module):
     @property
     def steps_at_once(self) -> int:
         """Most steps of several trajectories that go through the networks together."""
-        return min(STEPS_AT_ONCE, self.steps_in_memory)
+        most = STEPS_AT_ONCE * (2 if self.step_bytes < NARROW else 1)
+        return min(most, self.steps_in_memory)
 
     def tabulate(self, batch: Batch) -> Tables:
         """The tables of a batch: every network once, over all options, steps and trajectories."""

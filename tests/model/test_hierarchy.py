@@ -7,7 +7,8 @@ from hierarchies import make_batch, make_hierarchy
 from oracle import brute_force
 
 from ddco_pyro.inference import log_likelihood
-from ddco_pyro.model.batch import Batch
+from ddco_pyro.inference.kernel import LANES
+from ddco_pyro.model.batch import SIDE_BY_SIDE, Batch
 from ddco_pyro.model.networks import Inputs
 
 
@@ -84,3 +85,10 @@ def test_controls_that_want_a_gradient_get_it():
     found, expected = (torch.autograd.grad(own, batch.actions, retain_graph=True)[0] for own in values)
     assert found.abs().max() > 0.1
     torch.testing.assert_close(found, expected)
+
+
+def test_pieces_of_a_batch_fill_the_lanes_of_the_pass():
+    batch = make_batch(trajectories=20, steps=5)
+    assert [len(piece) for _, piece in batch.pieces(5 * 12)] == [8, 8, 4]
+    assert [len(piece) for _, piece in batch.pieces(5 * 6)] == [6, 6, 6, 2]
+    assert SIDE_BY_SIDE == LANES
