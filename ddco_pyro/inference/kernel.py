@@ -52,8 +52,8 @@ STEPS_A_THREAD = 4096
 
 _kept = threading.local()
 
-# The C library keeps as much free memory as twice the largest block that was given back to it. Without it the
-# system would clear the tensors of each step of training anew, which takes a fifth of the step.
+# The C library keeps free memory up to twice the largest block that it was given back. At first that is so
+# little that the system clears the tensors of each step of training anew, which takes a fifth of the step.
 torch.empty(2**25 - 2**16, dtype=torch.uint8)
 
 
@@ -164,18 +164,16 @@ def on_threads(run: Callable[[int, int], object], number: int, steps: int) -> No
     bounds = [number * part // threads for part in range(threads + 1)]
     torch.set_num_threads(1)
     try:
-        list(_pool(threads).map(run, bounds[:-1], bounds[1:]))
+        list(_pool(threads, os.getpid()).map(run, bounds[:-1], bounds[1:]))
     finally:
         torch.set_num_threads(most)
 
 
 @cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that keep their memory (:func:`memory`)."""
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads of a process, which keep their memory (:func:`memory`)."""
     return ThreadPoolExecutor(threads)
 
-
-os.register_at_fork(after_in_child=_pool.cache_clear)
 
 inner = numba.njit(error_model="numpy", fastmath={"contract"}, inline="always")
 # numba's own type knows no unpacking
