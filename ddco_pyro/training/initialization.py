@@ -253,8 +253,12 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
 
 
 class Moments(NamedTuple):
-    """Sums over steps, by which regressions are fitted and scored: of x x^T [F, F], x a^T [F, A], a² [A], and
-    1.
+    """Sums over steps by which regressions are fitted and scored.
+
+    :param square: Σ_t x x^T, [F, F].
+    :param product: Σ_t x a^T, [F, A].
+    :param controls: Σ_t a², [A].
+    :param steps: how many.
     """
 
     square: Tensor
