@@ -123,11 +123,8 @@ class Controller:
         if self.options == "marginal":
             self._log_marginal = arrive(self._log_marginal, now)
             sizes = self._log_marginal.shape[1:]  # C_D, ..., C_1
-            return (
-                tuple(reversed(torch.unravel_index(self._log_marginal.flatten(1).argmax(-1), sizes)))
-                if sizes
-                else ()
-            )
+            likeliest = self._log_marginal.flatten(1).argmax(-1) if sizes else None
+            return () if likeliest is None else tuple(reversed(torch.unravel_index(likeliest, sizes)))
         before = tuple(torch.tensor([choice]) for choice in self.choices)
         with Chosen(None if self.options == "most_likely" else generator):
             return choose(self.time, now, before or None)

@@ -52,12 +52,8 @@ def posterior(tables: Tables, lengths: Tensor) -> Posterior:
     found = fused.posteriors(tables, lengths, marginals=True)
     refuse_impossible(found.value > NEVER)
     posteriors, u = found.tables, found.marginals
-    v = tuple(
-        torch.cat(
-            [u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1
-        )  # choice 0 lasts one step: it is always selected
-        for u_d, selected in zip(u, posteriors.selection, strict=True)
-    )
+    pairs = zip(u, posteriors.selection, strict=True)  # choice 0 lasts one step: it is always selected
+    v = tuple(torch.cat([u_d[..., :1], selected.sum(2)[..., 1:]], dim=-1) for u_d, selected in pairs)
     followed = (torch.arange(1, tables.steps) < lengths[:, None]).unsqueeze(-1)
     w = tuple(torch.zeros_like(u_d) for u_d in u)  # choice 0 always ends
     for w_d, u_d, end in zip(w, u, posteriors.termination, strict=True):

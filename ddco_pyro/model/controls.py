@@ -59,12 +59,8 @@ class ControlScaling(nn.Module):
         varying = [dimension for dimension in range(size) if dimension not in constant]
         self.groups = [tuple(varying.index(dimension) for dimension in part.dims) for part in parts]
         count = len(varying)
-        shift, scale, low, high = (
-            np.zeros(count),
-            np.ones(count),
-            np.full(count, -math.inf),
-            np.full(count, math.inf),
-        )
+        shift, scale = np.zeros(count), np.ones(count)
+        low, high = np.full(count, -math.inf), np.full(count, math.inf)
         for dims, part in zip(self.groups, parts, strict=True):
             places = list(dims)
             if part.low:

@@ -231,10 +231,8 @@ def _seen_shape(spec: ObservationSpec, shapes: Shapes) -> tuple[int, ...]:
     stored = shapes[spec.key]
     if spec.bins and len(stored) == PICTURE_DIMENSIONS:
         raise ShapeError(f"observations: {spec.key!r} has pictures: bins are for vectors")
-    size, last = (
-        int(np.prod(stored)),
-        max([*spec.angles, *(first + 3 for first in spec.quaternions)], default=-1),
-    )
+    size = int(np.prod(stored))
+    last = max([*spec.angles, *(first + 3 for first in spec.quaternions)], default=-1)
     if last >= 0 and (len(stored) == PICTURE_DIMENSIONS or last >= size):
         raise ShapeError(
             f"observations: {spec.key!r} has shape {list(stored)} at each step: angles and quaternions name "

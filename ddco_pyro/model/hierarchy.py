@@ -183,9 +183,8 @@ class Hierarchy(nn.Module):
         size, constant, steps = dimensions.control_size, dimensions.constant, dimensions.steps
         self.steps, self.device = steps, HOST
         self.encoder = ObservationEncoder(spec.observations, dimensions.shapes, dimensions.tasks)
-        power = (
-            spec.control.power if spec.hierarchy is not None else 1.0
-        )  # nothing is latent in a flat policy
+        # nothing is latent in a flat policy
+        power = spec.control.power if spec.hierarchy is not None else 1.0
         self.register_buffer("power", torch.tensor(power, dtype=torch.float64))
         parts = dimensions.parts
         if parts is None and dimensions.control:
@@ -255,11 +254,9 @@ class Hierarchy(nn.Module):
     @property
     def read_shape(self) -> InputShape:
         """The shapes of what all networks but the trunk read: the observations, or the trunk's features."""
-        return (
-            self.input_shape
-            if self.trunk is None
-            else InputShape({TRUNK: self.trunk.features}, {}, self.steps)
-        )
+        if self.trunk is None:
+            return self.input_shape
+        return InputShape({TRUNK: self.trunk.features}, {}, self.steps)
 
     @cached_property
     def step_bytes(self) -> int:

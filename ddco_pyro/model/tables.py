@@ -240,10 +240,8 @@ def complete(tables: Tables, lengths: Tensor) -> Chain:
 
     An inert step keeps every choice and emits nothing, so it changes no probability.
     """
-    tables, steps = (
-        tables.normalised(),
-        tables.steps if tables.selection or tables.control else int(lengths.max()),
-    )
+    tables = tables.normalised()
+    steps = tables.steps if tables.selection or tables.control else int(lengths.max())
     alive = torch.arange(steps, device=lengths.device) < lengths[:, None]
     selection = tuple(
         _control_selects_control(table.double()) if level < tables.depth else table.double()

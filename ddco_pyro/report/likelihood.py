@@ -196,9 +196,6 @@ def parts(metrics: Metrics) -> Table | None:
     if rollouts and rollouts.seeds:
         each = {part: over_seeds("success", values) for part, values in rollouts.seeds.worth.items()}
         columns[f"Points of success, {len(rollouts.seeds.training_seeds)} training seeds"] = each
-    rows = [
-        [name, *(values.get(part, "–") for values in columns.values())]
-        for part, name in parts.items()
-        if getattr(found, part)
-    ]
+    known = [(part, name) for part, name in parts.items() if getattr(found, part)]
+    rows = [[name, *(values.get(part, "–") for values in columns.values())] for part, name in known]
     return Table(["Part", *columns], rows)

@@ -172,11 +172,8 @@ def section(fit: Fit, every: Sequence[Skill], shown: Shown, segmented: Segmented
     reads = deciding(fit, shown.demos)
     blocks: list[Block] = [note(shown.explained())]
     tasks, proposed = sorted({demo.task for demo in segmented.segments}), proposed_by_library(fit.spec)
-    whole = {
-        (one.level, one.choice): one
-        for one in diagnose(fit.metrics.options, segments=fit.metrics.segments)
-        if one.kind == "whole"
-    }
+    diagnoses = diagnose(fit.metrics.options, segments=fit.metrics.segments)
+    whole = {(one.level, one.choice): one for one in diagnoses if one.kind == "whole"}
     for place, (level, names) in reversed(list(enumerate(fit.names.items()))):
         if len(fit.names) > 1:
             blocks.append(Text(f"Level “{level}”", "heading"))

@@ -141,11 +141,8 @@ def _fit_all(
         pair: load(place, allow_code=True).metrics for pair, place in places.items() if is_finished(place)
     }
     on_event(CellsBegan("cross-validation", len(places), len(found)))
-    calls = {
-        pair: partial(_fitted, candidates[pair[0]].spec, folds[pair[1]], place)
-        for pair, place in places.items()
-        if pair not in found
-    }
+    left = [(pair, place) for pair, place in places.items() if pair not in found]
+    calls = {pair: partial(_fitted, candidates[pair[0]].spec, folds[pair[1]], place) for pair, place in left}
     compile_all()
     with run_all(calls, workers, "trained a fold") as fitted:
         for pair, metrics in fitted:

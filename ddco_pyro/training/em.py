@@ -417,10 +417,8 @@ class Expectation:
             for name, caller in self._callers.items()
         }
         named = [f"levels.{number}" for number in range(len(levels))]
-        logits = [
-            said[f"{name}.termination"].squeeze(-1) if f"{name}.termination" in said else None
-            for name in named
-        ]
+        ends = (said.get(f"{name}.termination") for name in named)
+        logits = [None if end is None else end.squeeze(-1) for end in ends]
         top = callers["meta_policy"]
         if self._discovering:
             uniform = torch.zeros(*piece.inputs.batch, 1, levels[-1].count)
@@ -434,9 +432,8 @@ class Expectation:
         depth = len(levels)
         chosen, ended, acted = found[:depth], found[depth : 2 * depth], found[2 * depth :]
         every = [*(f"{name}.policy" for name in named), *([] if self._discovering else ["meta_policy"])]
-        acting = {
-            name: own for name, own in zip(every, acted, strict=False) if name in stds and own is not None
-        }
+        of_callers = zip(every, acted, strict=False)
+        acting = {name: own for name, own in of_callers if name in stds and own is not None}
         densities = [table for name, table in zip(every, tables.control, strict=False) if name in acting]
         wanted = [leaf[name] for leaf in (said, stds) for name in acting]
         weighed = [(own * table).sum() for own, table in zip(acting.values(), densities, strict=True)]
@@ -465,10 +462,8 @@ class Expectation:
             for prefix, end, logit in zip(named, ended, before.termination, strict=True):
                 name = f"{prefix}.termination"
                 if name in sums and end is not None:
-                    slope, ending = (
-                        1 - (logit[..., 1:] / TERMINATION_BOUND).square(),
-                        logit[..., 1:].sigmoid(),
-                    )
+                    slope = 1 - (logit[..., 1:] / TERMINATION_BOUND).square()
+                    ending = logit[..., 1:].sigmoid()
                     asked = end[..., :1] + end[..., 1:]
                     of[name] = (end[..., 1:] - asked * ending) * slope
                     learned[name] = [Information(slice(0, 1), asked * ending * (1 - ending) * slope.square())]

@@ -253,12 +253,8 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
 
 
 class Moments(NamedTuple):
-    """Sums over steps by which regressions are fitted and scored.
-
-    :param square: Σ_t x x^T, [F, F].
-    :param product: Σ_t x a^T, [F, A].
-    :param controls: Σ_t a², [A].
-    :param steps: how many.
+    """Sums over steps by which regressions are fitted and scored: of x x^T [F, F], of x a^T [F, A], of a²
+    [A], and how many steps they are of.
     """
 
     square: Tensor

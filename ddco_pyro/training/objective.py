@@ -104,11 +104,9 @@ class Objective:
         """Find the constants that the networks take over, given the lowest level of the model."""
         if self.stage.from_constants:
             with torch.no_grad():
-                pieces = [
-                    (self.tables(model, piece, rows), piece.lengths)
-                    for rows, piece in self.data.train.pieces(model.steps_at_once)
-                ]
-            self.constants = fitted(pieces, self.data.seed(self.progress.restart, self.progress.stage))
+                pieces = self.data.train.pieces(model.steps_at_once)
+                tables = [(self.tables(model, piece, rows), piece.lengths) for rows, piece in pieces]
+            self.constants = fitted(tables, self.data.seed(self.progress.restart, self.progress.stage))
 
     def tables(self, model: Hierarchy, batch: Batch, rows: Tensor, tuning: bool = False) -> Tables:
         """The tables of demonstrations as logits, with their known choices.

@@ -5,6 +5,8 @@ import shutil
 import time
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 import selecting
 import toy_task
@@ -37,14 +39,32 @@ def inputs(tmp_path: Path, toy_run) -> Path:
 
 
 def results(folder: Path) -> dict[str, object]:
-    """What a folder holds: bytes of files, and numbers of JSON files, without seconds and places."""
+    """What a folder holds: bytes of files, what is in HDF5 files, and numbers of JSON files, without seconds
+    and places.
+    """
     found = {}
     for path in folder.rglob("*"):
         if path.suffix == ".json":
             found[str(path.relative_to(folder))] = json.loads(path.read_text()) | {"seconds": 0, "files": 0}
-        elif path.suffix in (".hdf5", ".safetensors", ".csv", ".md"):
+        elif path.suffix == ".hdf5":
+            found[str(path.relative_to(folder))] = contents(path)
+        elif path.suffix in (".safetensors", ".csv", ".md"):
             found[str(path.relative_to(folder))] = path.read_bytes()
     return found
+
+
+def contents(path: Path) -> dict[str, object]:
+    """Attributes and numbers by name; a file that is labelled twice has other bytes."""
+    with h5py.File(path) as file:
+        every = [file]
+        file.visititems(lambda _, one: every.append(one))
+        return {
+            one.name: (
+                {key: np.asarray(value).tolist() for key, value in one.attrs.items()},
+                np.asarray(one).tolist() if isinstance(one, h5py.Dataset) else None,
+            )
+            for one in every
+        }
 
 
 @pytest.mark.slow

@@ -14,11 +14,8 @@ from ddco_pyro.model.emissions.base import LOG_2PI, Emission, Given, Information
 
 def continuous_control(part: Part, mean: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
     """A mean, or a draw around it, within the bounds there are, in the control's own units."""
-    value, scale, shift = (
-        mean if z is None else mean + std * z,
-        np.array(part["scale"]),
-        np.array(part["shift"]),
-    )
+    value = mean if z is None else mean + std * z
+    scale, shift = np.array(part["scale"]), np.array(part["shift"])
     control: np.ndarray = value * scale + shift
     for ends, side in zip(part["ends"], (-1, 1), strict=True):
         for place, end in enumerate(ends):
@@ -90,9 +87,8 @@ class Gaussian(Emission):
     def relative_entropies(self, i: int) -> tuple[Tensor, Tensor]:
         """KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of caller i and each caller j, float64 [..., K] nats."""
         mean = self.mean.double()
-        variance = (
-            self.std.double().square().expand(*self.std.shape[:-2], *self.shape[-2:])
-        )  # steps may share it
+        # steps may share it
+        variance = self.std.double().square().expand(*self.std.shape[:-2], *self.shape[-2:])
         square, ratio = (mean - mean[..., i : i + 1, :]).square(), variance / variance[..., i : i + 1, :]
         to = (square / variance).sum(-1) + (1 / ratio + ratio.log() - 1).sum(-1)
         back = (square / variance[..., i : i + 1, :]).sum(-1) + (ratio - ratio.log() - 1).sum(-1)

@@ -21,11 +21,9 @@ from ddco_pyro.model.emissions.gaussian import Gaussian, continuous_control
 def hurdle_control(part: Part, numbers: np.ndarray, std: np.ndarray, z: np.ndarray | None) -> np.ndarray:
     """The exact value, at which scaled units are 0, or a continuous control; the last of ``z`` decides."""
     exactly = numbers[0] >= 0 if z is None else phi(z[-1]) < 1 / (1 + np.exp(-numbers[0]))
-    return (
-        np.array(part["shift"])
-        if exactly
-        else continuous_control(part, numbers[1:], std, None if z is None else z[:-1])
-    )
+    if exactly:
+        return np.array(part["shift"])
+    return continuous_control(part, numbers[1:], std, None if z is None else z[:-1])
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,8 @@ class Student(Gaussian):
     def by_dimension(self, actions: Tensor) -> Tensor:
         """The log-density of each dimension given those before it, float64 [..., K, A]."""
         squares = self._residuals(actions).square().cumsum(-1)
-        known = NU + torch.arange(
-            self.mean.shape[-1], dtype=torch.float64
-        )  # degrees of freedom, once the dimensions before are known
+        # degrees of freedom, once the dimensions before are known
+        known = NU + torch.arange(self.mean.shape[-1], dtype=torch.float64)
         before = torch.cat([torch.zeros_like(squares[..., :1]), squares[..., :-1]], -1)
         gammas = torch.lgamma((known + 1) / 2) - torch.lgamma(known / 2)
         tails = 0.5 * known * (before / NU).log1p() - 0.5 * (known + 1) * (squares / NU).log1p()
