@@ -72,8 +72,7 @@ for command, example in EXAMPLES.items():
 
 def main() -> None:
     """Run the command line; ends the process with 0, 1 or 2."""
-    young, middle, _ = gc.get_threshold()
-    gc.set_threshold(young, middle, 1000)  # searches of all that is imported would take most of a second
+    gc.set_threshold(*gc.get_threshold()[:2], 1000)  # searching all that is imported takes most of a second
     with _interruptible():
         status = _run()
     if not ("ompl" in sys.modules or "--allow-code" in sys.argv):  # bindings may report what Python leaves

@@ -93,11 +93,8 @@ def roll_out(
         for name, outcomes in by_method.items()
         if all(SUCCESS in outcome for outcome in outcomes)
     }
-    pairs = {
-        name: paired_difference(succeeded[fit.name], own)
-        for name, own in succeeded.items()
-        if name != fit.name and fit.name in succeeded
-    }
+    others = [name for name in succeeded if name != fit.name and fit.name in succeeded]
+    pairs = {name: paired_difference(succeeded[fit.name], succeeded[name]) for name in others}
     fit.metrics.rollouts = Rollouts(
         seed=seeds.start,
         episodes=episodes,

@@ -170,8 +170,7 @@ class ControlScaling(nn.Module):
         sizes, at, ends = [KINDS[part.kind].size(part) for part in self.parts], 0, self.ends()
         each = numbers.split(sizes, dim=-1) if len(sizes) > 1 else (numbers,)  # a split's gradient is a copy
         for dims, part, own, count in zip(self.groups, self.parts, each, self.counts, strict=True):
-            every = dims == (*range(len(self.varying)),)
-            places = slice(None) if every else list(dims)  # a list is copied to a tensor
+            places = slice(None) if dims == (*range(len(self.varying)),) else list(dims)  # lists are copied
             units, low, high = (of[places] for of in (self.scale.log(), *ends))
             given = Given(part, own, std[..., at : at + count], units, low, high)
             groups.append((dims, KINDS[part.kind].of(given)))

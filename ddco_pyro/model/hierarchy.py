@@ -275,8 +275,7 @@ class Hierarchy(nn.Module):
     @property
     def steps_at_once(self) -> int:
         """Most steps of several trajectories that go through the networks together."""
-        most = STEPS_AT_ONCE * (2 if self.step_bytes < NARROW else 1)
-        return min(most, self.steps_in_memory)
+        return min(STEPS_AT_ONCE * (2 if self.step_bytes < NARROW else 1), self.steps_in_memory)
 
     def tabulate(self, batch: Batch) -> Tables:
         """The tables of a batch: every network once, over all options, steps and trajectories."""

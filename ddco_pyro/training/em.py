@@ -412,10 +412,8 @@ class Expectation:
         stds = {name: torch.from_numpy(std.value).requires_grad_() for name, std in self._stds.items()}
         for name in stds:
             said[name].requires_grad_()
-        callers = {
-            name: caller(said[name], self.model.scaling, stds.get(name))
-            for name, caller in self._callers.items()
-        }
+        scaling, policies = self.model.scaling, self._callers.items()
+        callers = {name: caller(said[name], scaling, stds.get(name)) for name, caller in policies}
         named = [f"levels.{number}" for number in range(len(levels))]
         ends = (said.get(f"{name}.termination") for name in named)
         logits = [None if end is None else end.squeeze(-1) for end in ends]

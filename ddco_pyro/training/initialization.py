@@ -253,9 +253,7 @@ def cross_validated(model: Hierarchy, batch: Batch, ridge: float, seed: int) -> 
 
 
 class Moments(NamedTuple):
-    """Sums over steps by which regressions are fitted and scored: of x x^T [F, F], of x a^T [F, A], of a²
-    [A], and how many steps they are of.
-    """
+    """Sums over steps that regressions need: x x^T [F, F], x a^T [F, A], a² [A], and their number."""
 
     square: Tensor
     product: Tensor
@@ -269,8 +267,7 @@ class Moments(NamedTuple):
 
     def errors(self, weight: Tensor) -> Tensor:
         """Σ_t (a - W^T x)² of each of R regressions [R, F, A], [R, A]."""
-        found = (weight * (self.square @ weight - 2 * self.product)).sum(1)
-        return (self.controls + found).clamp(min=0)
+        return (self.controls + (weight * (self.square @ weight - 2 * self.product)).sum(1)).clamp(min=0)
 
 
 def left_out_likelihood(known: Moments, left_out: Moments, ridges: Tensor) -> Tensor:

@@ -272,8 +272,8 @@ class StageTraining:
             if library is not None and not isinstance(self.whole, Expectation):
                 score += float(library.log_density(model))
         if isinstance(self.whole, Expectation):
-            settings = self.objective.score, self.spec.optimizer.ridge
-            whole = Expectation(model, EVERYTHING, *settings, prior=library)
+            ridge = self.spec.optimizer.ridge
+            whole = Expectation(model, EVERYTHING, self.objective.score, ridge, prior=library)
             score += whole.log_prior(train.select(torch.tensor([0])))
         return score / train.steps
 

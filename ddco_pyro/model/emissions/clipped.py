@@ -47,8 +47,7 @@ class Clipped(Gaussian):
         errors, before = self._errors(actions.clamp(self.low, self.high)), actions.dim() - 1
         each = by_step(self._scored(errors), before)
         low, high = (by_step(on, before).flatten() for on in (actions <= self.low, actions >= self.high))
-        on_bound = np.flatnonzero((low ^ high).numpy())  # torch's own takes ten times as long
-        place = torch.from_numpy(on_bound)  # log Φ is computed there alone, for each caller
+        place = torch.from_numpy(np.flatnonzero((low ^ high).numpy()))  # log Φ is computed on bounds alone
         places = (place + len(low) * torch.arange(len(each)).unsqueeze(1)).flatten()
         beyond = by_step(errors, before).flatten().index_select(0, places)
         mass = LogNormal.apply(beyond * (low[place] * 2.0 - 1).repeat(len(each)))

@@ -87,7 +87,6 @@ class Gaussian(Emission):
     def relative_entropies(self, i: int) -> tuple[Tensor, Tensor]:
         """KL(π_i ‖ π_j) and KL(π_j ‖ π_i) of caller i and each caller j, float64 [..., K] nats."""
         mean = self.mean.double()
-        # steps may share it
         variance = self.std.double().square().expand(*self.std.shape[:-2], *self.shape[-2:])
         square, ratio = (mean - mean[..., i : i + 1, :]).square(), variance / variance[..., i : i + 1, :]
         to = (square / variance).sum(-1) + (1 / ratio + ratio.log() - 1).sum(-1)
